@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 import warnings
+import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,10 +28,10 @@ from rclpy.qos import QoSProfile, qos_profile_action_status_default
 
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.errors import WireError
 from wm_nodes.ros.clients import goal_result
 from wm_nodes.ros.endpoint_matching import EndpointTable
 from wm_nodes.ros.qos import topic
-from wm_nodes.ros.wire import WireError
 
 DOMAINS = range(20, 60)
 PORT, FIRST_PORT, PORTS_PER_DOMAIN = "fastrtps_port", 7400, 250
@@ -248,8 +249,10 @@ class Graph:
     def start(
         self, node: str, namespace: str = "/wm", launcher: tuple[str, ...] | None = None, **params: Any
     ) -> subprocess.Popen[bytes] | ForkedNode:
-        """Fork wm_nodes.nodes.<node>_node, or start python LAUNCHER -m ...; a parameter is given by keyword."""
-        values = {"config_file": self.folder / "config.yaml", "run_dir": self.folder, **params}
+        """Fork wm_nodes.nodes.<node>_node, or start python LAUNCHER -m ...; a parameter is given by keyword, a
+        setting as section__key."""
+        settings = {name: params.pop(name) for name in [*params] if "__" in name}
+        values = {"config_file": self.config_file(**settings), "run_dir": self.folder, **params}
         module, args = f"wm_nodes.nodes.{node}_node", ["--ros-args", "-r", f"__ns:={namespace}"]
         for name, value in values.items():
             args += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
@@ -264,24 +267,35 @@ class Graph:
         self.processes[name] = subprocess.Popen(command, env=self.environment(), stdout=log, stderr=subprocess.STDOUT)
         return self.processes[name]
 
+    def config_file(self, **settings: Any) -> Path:
+        """The run's configuration, or beside it one with changes, as section__key."""
+        run = self.folder / "config.yaml"
+        if not settings:
+            return run
+        text = dump_config(load_config(str(run), {name.replace("__", "."): value for name, value in settings.items()}))
+        path = self.folder / f"config_{zlib.crc32(text.encode()):08x}.yaml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
     def environment(self) -> dict[str, str]:
-        path = os.pathsep.join([str(TOY_FOLDER), *filter(None, [os.environ.get("PYTHONPATH")])])
+        path = os.pathsep.join([str(TOY_FOLDER), str(TOY_FOLDER.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
         return {
             **os.environ, "PYTHONPATH": path, "ROS_DOMAIN_ID": str(self.domain), "OMP_NUM_THREADS": "1",
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": str(self.folder / "ros_log"),
         }
 
     def start_environment(self, factory: str = "toy:make_environment", num_envs: int = 4, **params: Any) -> Any:
-        return self.start("environment", backend="factory", backend_factory=factory, num_envs=num_envs, **params)
+        named = {"backend": "environment", "environment__factory": factory, "num_envs": num_envs}
+        return self.start("environment", **named, **params)
 
     def start_policy(self, **params: Any) -> Any:
-        return self.start("policy", policy_factory="toy:make_policy", **params)
+        return self.start("policy", policy__factory="toy:make_policy", **params)
 
     def start_reward(self, **params: Any) -> Any:
         return self.start("reward_evaluator", reward="rule", **params)
 
     def start_learner(self, **params: Any) -> Any:
-        return self.start("learner", policy_factory="toy:make_policy", **params)
+        return self.start("learner", policy__factory="toy:make_policy", **params)
 
     def start_training_nodes(self, **learner: Any) -> None:
         """environment, policy, reward_evaluator and learner, as in a training run."""

@@ -127,7 +127,7 @@ def test_no_action_is_published_or_executed_after_an_emergency_stop_until_it_is_
     graph.start_environment(
         "toy:make_long_environment", num_envs=N, mode="asynchronous", control_period_s=PERIOD_S, max_action_age_s=5.0
     )
-    policy = graph.start("policy", policy_factory="toy:make_slow_policy", mode="asynchronous")
+    policy = graph.start("policy", policy__factory="toy:make_slow_policy", mode="asynchronous")
     wait_until("both nodes", lambda: estop.get_subscription_count() >= 2)
     for _ in range(3):
         seen = len(actions)
@@ -157,7 +157,7 @@ def test_no_action_is_published_or_executed_after_an_emergency_stop_until_it_is_
     assert policy.wait(20) == 0
     del probe.diagnostics["/wm/policy"]
     count = len(actions)
-    graph.start("policy", policy_factory="toy:make_slow_policy", mode="asynchronous")
+    graph.start("policy", policy__factory="toy:make_slow_policy", mode="asynchronous")
     wait_until("the new policy", lambda: "/wm/policy" in probe.diagnostics)
     wait_until("the stop in it", lambda: "emergency stop" in probe.diagnostics["/wm/policy"].message)
     send = probe.publisher("action")

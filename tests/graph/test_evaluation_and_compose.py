@@ -32,7 +32,7 @@ from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.reports.summary import plain, read_readings
 from wm_nodes.training.weights import pack_weights, save_weights, unpack_weights
-from wm_nodes.world_model.imagined_episodes import start_of
+from wm_nodes.world_model.starts import start_of
 
 pytestmark = pytest.mark.graph
 
@@ -42,7 +42,7 @@ def test_evaluation_over_dds_equals_evaluation_in_one_process(graph: Graph, prob
     policy = toy.make_policy(graph.config)
     save_weights(policy, graph.folder / "start.safetensors")
     graph.start_environment(namespace="/wm/sim", num_envs=3)
-    graph.start("evaluation", policy_factory="toy:make_policy")
+    graph.start("evaluation", policy__factory="toy:make_policy")
     client = probe.action(Evaluate, "evaluate")
     goal = Evaluate.Goal(policy_uri="start.safetensors", episodes=7, seed=1000, deterministic=False)
     result = probe.finish(probe.send(client, goal))
@@ -61,7 +61,7 @@ def test_evaluation_over_dds_equals_evaluation_in_one_process(graph: Graph, prob
 def test_cancel_ends_an_evaluation_and_a_rollout_within_a_second(graph: Graph, probe: Probe) -> None:
     save_weights(toy.make_policy(graph.config), graph.folder / "start.safetensors")
     graph.start_environment("toy:make_long_environment", namespace="/wm/sim", num_envs=3)
-    graph.start("evaluation", policy_factory="toy:make_policy")
+    graph.start("evaluation", policy__factory="toy:make_policy")
     graph.start_environment("toy:make_long_environment")
     graph.start_policy()
     goals = {
@@ -78,10 +78,10 @@ def test_cancel_ends_an_evaluation_and_a_rollout_within_a_second(graph: Graph, p
         assert time.monotonic() - began < within(1.0), name
 
 
-def start_composed(graph: Graph, params: dict[str, dict[str, Any]], *options: str) -> None:
+def start_composed(graph: Graph, params: dict[str, dict[str, Any]], *options: str, **settings: Any) -> None:
     command = [
         sys.executable, "-m", "wm_nodes.nodes.compose", *options, *params,
-        "--ros-args", "-r", "__ns:=/wm", "-p", f"config_file:={graph.folder / 'config.yaml'}",
+        "--ros-args", "-r", "__ns:=/wm", "-p", f"config_file:={graph.config_file(**settings)}",
         "-p", f"run_dir:={graph.folder}", "--params-file", str(graph.folder / "nodes.yaml"),
     ]
     content = {f"/**/{node}": {"ros__parameters": values} for node, values in params.items()}
@@ -94,11 +94,9 @@ def start_composed(graph: Graph, params: dict[str, dict[str, Any]], *options: st
 def test_a_composed_process_steps_by_direct_call_and_trains_to_the_same_weights(graph: Graph, probe: Probe) -> None:
     transitions = probe.listen("env/transition")
     start_composed(graph, {
-        "environment": {"backend": "factory", "backend_factory": "toy:make_environment", "num_envs": 4},
-        "policy": {"policy_factory": "toy:make_policy"},
-        "learner": {"policy_factory": "toy:make_policy"},
+        "environment": {"backend": "environment", "num_envs": 4}, "policy": {}, "learner": {},
         "reward_evaluator": {"reward": "rule"},
-    })
+    }, environment__factory="toy:make_environment", policy__factory="toy:make_policy")
     result = probe.finish(probe.send(probe.action(Train, "train"), Train.Goal(updates=2)))
     assert (result.termination_reason, result.policy_version) == (Train.Result.FINISHED, 3)
     toy.assert_trained_in_one_process(graph.folder / "policies" / "policy_000003.safetensors", updates=2)

@@ -12,7 +12,7 @@ from graph.harness import Graph, Probe, shm_files, wait_until
 
 from wm_msgs.action import Train
 from wm_msgs.msg import Credit, TransitionBatch
-from wm_nodes.ros.wire import WireError
+from wm_nodes.core.errors import WireError
 from wm_nodes.training.weights import save_weights
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
@@ -132,7 +132,7 @@ def test_a_consumer_without_credit_holds_the_environment_up_until_it_is_dropped(
 @pytest.mark.parametrize(
     ("params", "words"),
     [
-        ({"backend": "gazebo"}, "backend must be one of world_model, video_model, maniskill, factory; got 'gazebo'"),
+        ({"backend": "gazebo"}, "must be one of world_model, video_model, environment, evaluation; got 'gazebo'"),
         ({"num_env": 3}, "unknown parameter 'num_env'; did you mean 'num_envs'?"),
         (
             {"qos_overrides./wm/env/image.publisher.depth": 2},
@@ -140,11 +140,11 @@ def test_a_consumer_without_credit_holds_the_environment_up_until_it_is_dropped(
             "change the topic's row in wm_nodes/recording/topics.py",
         ),
         ({"num_envs": 0}, "num_envs must be at least 1; got 0"),
-        ({"backend": "factory", "backend_factory": "nowhere:make"}, "No module named 'nowhere'"),
+        ({"backend": "environment", "environment__factory": "nowhere:make"}, "No module named 'nowhere'"),
         ({"backend": "world_model"}, "model_dir"),
         ({"config_file": "/nowhere.yaml"}, "'/nowhere.yaml' does not exist"),
         (
-            {"backend": "factory", "backend_factory": "toy:make_environment_of_large_images", "num_envs": 257},
+            {"backend": "environment", "environment__factory": "toy:make_environment_of_large_images", "num_envs": 257},
             "num_envs=257 images of 256 x 512 px make one env/image of 106954752 bytes, more than the 100663296 that "
             "DDS carries in time; lower num_envs or simulation.image_size",
         ),
@@ -167,7 +167,7 @@ def test_weights_of_another_architecture_end_the_node_with_one_line_that_names_t
 ) -> None:
     file = graph.folder / "other.safetensors"
     save_weights(torch.nn.Linear(2, 2), file)
-    assert graph.start(node, policy_factory="toy:make_policy", initial_policy=file).wait(60) == 1
+    assert graph.start(node, policy__factory="toy:make_policy", initial_policy=file).wait(60) == 1
     log = graph.log(f"/wm/{node}")
     assert f"initial_policy {file}: " in log and "weights of another architecture: " in log
     assert "use the configuration it was made by" in log and "Traceback" not in log
@@ -214,8 +214,8 @@ def test_fifty_start_stop_cycles_leave_no_shared_memory(graph: Graph) -> None:
     )
     before = shm_files()
     given = {
-        "config_file": graph.folder / "config.yaml", "run_dir": graph.folder, "backend": "factory",
-        "backend_factory": "toy:make_environment", "num_envs": 4,
+        "config_file": graph.config_file(environment__factory="toy:make_environment"), "run_dir": graph.folder,
+        "backend": "environment", "num_envs": 4,
     }
     parameters = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
     command = [sys.executable, "-c", cycle, "--ros-args", *parameters]

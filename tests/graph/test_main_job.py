@@ -2,13 +2,11 @@
 
 import hashlib
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from graph.launched import train_policy
 from judge_server import PickyServer, serving
 from model_folders import make_model_folder
 from safetensors.numpy import save_file
@@ -20,20 +18,13 @@ from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reports.summary import read_summary
 from wm_nodes.training.metrics import read_metrics
 from wm_nodes.world_model import load_model_folder
-from wm_nodes.world_model.imagined_episodes import INSTRUCTIONS
+from wm_nodes.world_model.starts import INSTRUCTIONS
 
 pytestmark = pytest.mark.graph
-PROGRAM = "import sys; from wm_nodes.apps.cli import main; sys.exit(main(['train-policy', *sys.argv[1:]]))"
 SMALL = ["--preset", "smoke", *(f"--set={name}" for name in (
     "acceptance.num_episodes=2", "acceptance.clone_episodes=2", "data.num_workers=1", "simulation.max_episode_steps=12"
 ))]
 RATES = ("real_before", "real_after", "imagined_before", "imagined_after")
-
-
-def start(arguments: list[str], domain: int) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "COLUMNS": "160"}
-    command = [sys.executable, "-c", PROGRAM, "--domain-id", str(domain), *arguments]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
 
 
 @pytest.mark.slow
@@ -43,13 +34,13 @@ def test_the_main_job_stops_at_acceptance_and_when_forced_leaves_summary_report_
     run_dir = tmp_path / "run"
     arguments = [*SMALL, "--set", "acceptance.tool_error_ratio=0.001", "--run-dir", str(run_dir),
                  "--set", "exploit_meter.every=2", "--set", "exploit_meter.episodes=3"]
-    refused = start(arguments, ros_domain)
+    refused = train_policy(arguments, ros_domain)
     assert refused.returncode == 3, refused.stdout + refused.stderr
     said = refused.stderr
     assert "tool error / copying" in said and "or go on with --force" in said
     policies = sorted(path.name for path in (run_dir / "policies").iterdir())
     assert policies == ["policy_000001.safetensors", "weak.safetensors"], "trained in a model that failed"
-    done = start(["--run-dir", str(run_dir), "--force"], ros_domain)
+    done = train_policy(["--run-dir", str(run_dir), "--force"], ros_domain)
     assert done.returncode == 0, done.stdout + done.stderr
     summary = read_summary(run_dir)
     assert (summary["task"], summary["preset"], summary["seed"]) == ("push_cube", "smoke", 0)
@@ -85,7 +76,7 @@ def test_two_online_rounds_refresh_the_model_and_a_resumed_run_repeats_only_what
     write_some_starts(run_dir / "starts.safetensors")
     arguments = [*SMALL, "--force", "--rounds", "2", "--model-dir", str(model), "--run-dir", str(run_dir),
                  "--set", "evaluation.episodes=2", "--compose"]
-    done = start(arguments, ros_domain)
+    done = train_policy(arguments, ros_domain)
     assert done.returncode == 0, done.stdout + done.stderr
     assert {path.name for path in run_dir.iterdir()} <= RUN_ENTRIES, "a peer may write what is not listed there"
     first, last = read_summary(run_dir)["rounds"]
@@ -101,7 +92,7 @@ def test_two_online_rounds_refresh_the_model_and_a_resumed_run_repeats_only_what
     for lost in ("trained.json", "evaluations/real_before.json"):  # as if stopped after the last update of round 1
         (run_dir / "rounds" / "1" / lost).unlink()
     finished = {path: path.stat().st_mtime_ns for path in (run_dir / "rounds" / "2").rglob("*") if path.is_file()}
-    done = start(["--run-dir", str(run_dir)], ros_domain)
+    done = train_policy(["--run-dir", str(run_dir)], ros_domain)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "training the policy in the world model: 0 updates" in done.stdout
     assert done.stdout.count("starting the graph") == 1
@@ -123,7 +114,7 @@ def test_the_agent_pays_the_policy_and_the_run_goes_on_with_that_reward_only(
                  "--set", "ppo.num_steps=12", "--set", "ppo.num_envs=3", "--compose"]
     with serving(PickyServer()) as server:
         agent = ["--reward", "agent", "--judge", server.url, "--judge-model", "judge"]
-        done = start([*arguments, *agent], ros_domain)
+        done = train_policy([*arguments, *agent], ros_domain)
         assert done.returncode == 0, done.stdout + done.stderr
         asked = len(server.requests)
         assert asked

@@ -33,7 +33,7 @@ def start_all(graph: Graph, probe: Probe) -> None:
     graph.start_learner()
     graph.start("recorder", record_at_start=False, min_free_mib=16)
     graph.start("player", play_at_start=False)
-    graph.start("evaluation", policy_factory="toy:make_policy")
+    graph.start("evaluation", policy__factory="toy:make_policy")
     wait_until("the nodes", lambda: all(probe.value(node, "state") == "active" for node in NODES))
 
 

@@ -77,7 +77,7 @@ def test_evaluation_episodes_are_recorded_and_a_killed_simulator_or_evaluation_n
     start_recorder(graph)
     nodes: dict[str, Any] = {
         "/wm/sim/environment": lambda: graph.start_environment(namespace="/wm/sim", num_envs=3),
-        "/wm/evaluation": lambda: graph.start("evaluation", policy_factory="toy:make_policy"),
+        "/wm/evaluation": lambda: graph.start("evaluation", policy__factory="toy:make_policy"),
     }
     for start in nodes.values():
         start()
@@ -165,7 +165,7 @@ def test_a_client_of_a_killed_learner_gets_an_error(
             training.result(within(15.0))
 
 
-@pytest.mark.parametrize("learner", [{}, {"learner_factory": "toy:make_stuck_learner"}])
+@pytest.mark.parametrize("learner", [{}, {"learner__factory": "toy:make_stuck_learner"}])
 def test_a_learner_that_is_told_to_end_answers_its_goals_client_also_where_it_is_stuck(
     graph: Graph, probe: Probe, learner: dict[str, str]
 ) -> None:

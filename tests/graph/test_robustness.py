@@ -21,11 +21,12 @@ from wm_msgs.action import Train
 from wm_msgs.msg import EpisodeEvent, ErrorCode
 from wm_msgs.srv import ResetBatch, StartRecording, StopRecording
 from wm_nodes.apps.cli import main
+from wm_nodes.core.errors import WireError
 from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.training_run import restore
 from wm_nodes.recording import BagError, recover
 from wm_nodes.ros import calls
-from wm_nodes.ros.wire import ResetCommand, WireError
+from wm_nodes.ros.wire import ResetCommand
 
 pytestmark = pytest.mark.graph
 
@@ -88,7 +89,7 @@ def test_a_node_without_a_renderer_ends_with_one_line(graph: Graph) -> None:
         update={"simulation": graph.config.simulation.model_copy(update={"render_device": "cuda:77"})}
     )
     graph = Graph(graph.domain, graph.folder, graph.config)
-    assert graph.start("environment", backend="maniskill").wait(90) == 1
+    assert graph.start("environment", backend="environment").wait(90) == 1
     log = graph.log("/wm/environment")
     assert "no renderer at cuda:77" in log
     assert "Traceback" not in log

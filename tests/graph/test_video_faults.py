@@ -30,7 +30,6 @@ from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.recorded_buffers import read_clips
 from wm_nodes.video_rl.reference_reward import attach_rewards
-from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.video_rl.training_run import CHECKPOINT
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
@@ -240,7 +239,7 @@ def test_a_full_disk_ends_training_as_failed_with_one_error_and_the_last_checkpo
     log = loop.graph.log("/wm/video_learner")
     assert log.count("training ended") == errors + 1 and "Traceback" not in log
     network, config = load_video_folder(loop.model).network, loop.config
-    loaded = GrpoLearner(network, config.grpo, rollout_settings(config.rollout), seed=config.seed)
+    loaded = GrpoLearner(network, config.grpo, config.rollout, seed=config.seed)
     assert loaded.load(checkpoint) == before.iterations
     full_disk(learner)
     again = loop.train(1)

@@ -354,8 +354,7 @@ def test_settings_that_the_graphs_model_or_the_ratio_cannot_have_are_refused_bef
 ) -> None:
     for setting, said in (
         ("grpo.kl.anchor=lora_off", "the graph's video model has none: take frozen"),
-        ("grpo.mask_source=recompute", "mask_source recompute has the full likelihood (DD-12), got logprob_weight cps"),
-        ("grpo.ratio_norm=true", "ratio_norm replaces the weight of the likelihood, got logprob_weight cps"),
+        ("grpo.objective=nft", "objective nft has no transitions, got kl.mode mean with kl.anchor dual"),
     ):
         run_dir = tmp_path / "run"
         assert main(["train-video-model", "--set", setting, "--run-dir", str(run_dir)]) == 2

@@ -23,7 +23,7 @@ from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.reference_reward import load_probe
-from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts, rollout_settings
+from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
 from wm_nodes.video_rl.train import post_train
 from wm_nodes.video_rl.training_run import VIDEO_FILES
 
@@ -88,7 +88,7 @@ class LocalLoop:
             load_video_folder(folder), load_clips([bag], STRIDE), config, load_probe(MODEL_DIR)
         )
         self._network = load_video_folder(folder).network
-        self._learner = GrpoLearner(self._network, config.grpo, rollout_settings(config.rollout), seed=config.seed)
+        self._learner = GrpoLearner(self._network, config.grpo, config.rollout, seed=config.seed)
         self._training = post_train(self._learner, self, ITERATIONS)
         self._files = [self._packed()]
         self.versions = [0]

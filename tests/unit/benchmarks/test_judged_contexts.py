@@ -34,7 +34,6 @@ from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_model.tokenizer_codec import codec_of_world_model
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.reference_reward import load_probe
-from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.video_rl.train import post_train
 
 MODEL_DIR, FPS = shipped_model("push_cube"), 2.5
@@ -68,7 +67,7 @@ def test_the_agents_reward_is_mixed_with_others_and_is_what_the_service_says_of_
     assert found.rewards["agent"].tolist() == [verdict.reward for verdict in alone] == again.rewards["agent"].tolist()
     assert len(set(found.rewards["agent"].tolist())) > 1
     assert_close(found.rewards["total"], found.rewards["agent"] + 0.5 * found.rewards["psnr_db"], equal_nan=True)
-    learner = GrpoLearner(folder.network, config.grpo, rollout_settings(config.rollout), seed=config.seed)
+    learner = GrpoLearner(folder.network, config.grpo, config.rollout, seed=config.seed)
     with JudgedContexts(folder, contexts, config, load_probe(MODEL_DIR), FPS) as source:
         (buffer, report), = post_train(learner, source, 1)
     assert torch.equal(buffer.rewards["total"].nan_to_num(), found.rewards["total"].nan_to_num())
@@ -82,7 +81,7 @@ def test_the_preset_outcome_trains_on_half_outcome_and_half_agent(given: Any) ->
         **values, "rewards": {"outcome": 0.5, "agent": 0.5}, "groups.contexts": 2, "groups.group_size": 4,
     })
     before = {name: value.clone() for name, value in folder.network.state_dict().items()}
-    learner = GrpoLearner(folder.network, config.grpo, rollout_settings(config.rollout), seed=config.seed)
+    learner = GrpoLearner(folder.network, config.grpo, config.rollout, seed=config.seed)
     with JudgedContexts(folder, contexts, config, load_probe(MODEL_DIR), FPS) as source:
         (buffer, report), = post_train(learner, source, 1)
     rewards = buffer.rewards

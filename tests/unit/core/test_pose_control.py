@@ -11,7 +11,7 @@ from transforms3d.quaternions import quat2mat
 from wm_nodes.config.load import load_config
 from wm_nodes.core.action_spaces import MAX_TILT_RAD, MAX_YAW_RAD
 from wm_nodes.core.rotations import multiply, to_quaternion, to_vector
-from wm_nodes.core.tool_control import hold_actions, moves_pose, next_state, next_state_tensor
+from wm_nodes.core.tool_control import CommandedMove, hold_actions, moves_pose, next_state
 from wm_nodes.core.types import FloatArray
 from wm_nodes.environments.maniskill.spec import simulation_spec
 
@@ -58,10 +58,10 @@ def test_the_right_rotation_is_made_first() -> None:
 
 
 def test_torch_and_numpy_give_the_same_bits() -> None:
-    scale, box = torch.tensor(SPEC.action_scale), torch.tensor([SPEC.state_low, SPEC.state_high])
+    move = CommandedMove(SPEC, torch.device("cpu"))
     for states, actions in walk(30):
         moved = next_state(states, actions, SPEC)
-        tensor = next_state_tensor(torch.from_numpy(states), torch.from_numpy(actions), scale, box, pose=True)
+        tensor = move(torch.from_numpy(states), torch.from_numpy(actions))
         assert tensor.dtype == torch.float32
         np.testing.assert_array_equal(tensor.numpy(), moved)
     assert moves_pose(SPEC) and np.abs(states[:, 5]).max() > 1

@@ -124,7 +124,7 @@ def test_each_imagined_episode_ends_by_the_done_signal_of_its_task(imagined: tup
     config = CONFIG.with_values(reward=CONFIG.reward.with_values(success_threshold=1.0))
     env = make_imagined_environment(config, folder, starts, num_envs=8, seed=0)
     signals = list[torch.Tensor]()
-    model = env._rollouts[0]._model
+    model = env.episodes.imagined[0].model
     advance = model.advance
 
     def spy(*arguments: object) -> tuple[torch.Tensor, torch.Tensor]:
@@ -147,7 +147,7 @@ def test_the_device_program_imagines_the_same(imagined: tuple[Path, Path]) -> No
     env = make_imagined_environment(CONFIG, model, starts, num_envs=4, seed=0)
     device = DeviceEnvironment.beside(env)
     seen = env.reset(None, np.arange(4, dtype=np.uint64))
-    device.reset(torch.ones(4, dtype=torch.bool), torch.from_numpy(env._starts))
+    device.reset(torch.ones(4, dtype=torch.bool), env.episodes.starts_N)
     actions = np.random.default_rng(0).uniform(-1, 1, (4, 7)).astype(np.float32)
     seen, on_device = env.step(actions), device.step(torch.from_numpy(actions))
     np.testing.assert_array_equal(device.frames_NHWC.numpy(), seen.observation.image)

@@ -22,8 +22,7 @@ from wm_nodes.policy_rl.factories import (
     models_of,
 )
 from wm_nodes.policy_rl.initial_policy import STARTS
-from wm_nodes.policy_rl.rollouts import collect_rollout, rollout_statistics
-from wm_nodes.policy_rl.tensor_rollout import TensorRollout, tensors_of
+from wm_nodes.policy_rl.rollouts import TensorRollout, collect_rollout, rollout_statistics, tensors_of
 from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.reward import RewardModel, RuleReward
 from wm_nodes.world_model import DeviceEnvironment, load_starts, precision

@@ -19,8 +19,7 @@ from wm_nodes.policy_rl.factories import (
 )
 from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.policy_rl.ppo import PpoLearner
-from wm_nodes.policy_rl.rollouts import rollout_statistics
-from wm_nodes.policy_rl.tensor_rollout import TensorRollout
+from wm_nodes.policy_rl.rollouts import TensorRollout, rollout_statistics
 from wm_nodes.world_model import DeviceEnvironment
 
 MODEL = shipped_model("reach")
@@ -61,7 +60,7 @@ def test_the_devices_rollout_has_the_cpus_numbers(device: Device) -> None:
 def test_a_lock_step_waits_for_nothing_and_a_rollout_copies_the_same_however_long(device: Device) -> None:
     config = load_config("cpu", {"task": "reach", "device": device.name, "reward.dense_weight": 1.0})
     policy = make_policy(config, MODEL)
-    env = make_training_environment(config, MODEL, MODEL / STARTS, num_envs=4, seed=0)
+    env = make_training_environment(config, MODEL, num_envs=4, seed=0)
     assert isinstance(env, DeviceEnvironment)
     collector = DeviceCollector(env, policy, make_endogenous_reward(config, MODEL))
     assert collector.collect(1, 0, 1).features_TN.device.type == "cuda"

@@ -18,7 +18,7 @@ from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.recording import read_episodes
 from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model import load_model_folder, load_starts
-from wm_nodes.world_model.imagined_episodes import load_start_seeds
+from wm_nodes.world_model.starts import load_start_seeds
 from wm_nodes.world_model.validation.open_loop import episode_errors, evaluate_rollouts
 
 

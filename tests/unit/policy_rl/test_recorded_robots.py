@@ -7,20 +7,27 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from graph.foreign_arm import ForeignArm
 
+from examples import own_environment
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import EnvironmentSpec
-from wm_nodes.core.tool_control import next_commanded
+from wm_nodes.core.tool_control import CommandedMove
 from wm_nodes.core.types import Episode
+from wm_nodes.environments.batch import EnvironmentBatch
 from wm_nodes.policy_rl.factories import make_imagined_environment, make_policy
 from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.policy_rl.pretraining import model_from_recordings
 from wm_nodes.recording import EpisodeBagWriter
-from wm_nodes.world_model import ActionModel, ImaginedEnvironment, Tokenizer, load_model_folder, save_model_folder
-from wm_nodes.world_model.device_environment import DeviceEnvironment
+from wm_nodes.world_model import (
+    ActionModel,
+    DeviceEnvironment,
+    ImaginedEnvironment,
+    Tokenizer,
+    load_model_folder,
+    save_model_folder,
+)
 
 TINY = {
     "task": "", "tokenizer.width": 16, "tokenizer.patch_px": 8, "tokenizer.latent_dim": 8,
@@ -33,7 +40,7 @@ NO_STATE = {"state_names": (), "state_units": ()}
 
 def record(folder: Path, count: int = 12, **changes: Any) -> Path:
     """A bag of random episodes of the arm, of what `changes` of its spec leave of the state."""
-    arm = ForeignArm(1, 0)
+    arm = EnvironmentBatch(own_environment.SPEC, [own_environment.Arm()], 0)
     spec = replace(arm.spec, **changes)
     stream = numpy_stream(0, "random actions")
     with EpisodeBagWriter(folder, spec, run_id="lab", start_ns=1) as bag:
@@ -96,7 +103,7 @@ def test_a_policy_scales_measured_states_by_what_was_recorded(config: RunConfig,
 
 def mixed() -> EnvironmentSpec:
     """Three commanded values before a measured one."""
-    spec = ForeignArm(1, 0).spec
+    spec = own_environment.SPEC
     return replace(
         spec, action_names=spec.action_names[:3], action_units=("m",) * 3, action_scale=(0.1,) * 3,
         state_names=("target_x", "target_y", "target_z", "force"), state_units=("m", "m", "m", "N"),
@@ -107,8 +114,9 @@ def mixed() -> EnvironmentSpec:
 def test_commanded_values_follow_the_action_inside_their_box_and_measured_ones_stay() -> None:
     spec = mixed()
     assert spec.measured == (3,)
-    moved = next_commanded(np.array([[0.5, 0.5, 0.0, 2.0]], np.float32), np.ones((1, 3), np.float32), spec)
-    np.testing.assert_allclose(moved, [[0.6, 0.6, 0.05, 2.0]], atol=1e-6)
+    move = CommandedMove(spec, torch.device("cpu"))
+    moved = move(torch.tensor([[0.5, 0.5, 0.0, 2.0]]), torch.ones(1, 3))
+    torch.testing.assert_close(moved, torch.tensor([[0.6, 0.6, 0.05, 2.0]]), atol=1e-6, rtol=0)
 
 
 def test_the_device_program_moves_a_mixed_state_as_the_imagined_environment_does(
@@ -129,7 +137,7 @@ def test_the_device_program_moves_a_mixed_state_as_the_imagined_environment_does
     device = DeviceEnvironment.beside(env)
     env.reset()
     with torch.inference_mode():
-        device.reset(torch.ones(2, dtype=torch.bool), torch.from_numpy(env._starts))
+        device.reset(torch.ones(2, dtype=torch.bool), env.episodes.starts_N)
         for step in range(3):
             actions = numpy_stream(step, "actions").uniform(-1, 1, (2, 3)).astype(np.float32)
             states = env.step(actions).observation.state

@@ -8,7 +8,6 @@ from video_toys import weights
 from wm_nodes.config.load import load_video_config
 from wm_nodes.video_rl import train
 from wm_nodes.video_rl.grpo import GrpoLearner
-from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.video_rl.toy_scene import ToyContexts, draw_scenes, load_base, score
 from wm_nodes.video_rl.train import post_train
 
@@ -20,7 +19,7 @@ CONFIG = load_video_config("base", {
 
 def make_learner() -> tuple[ToyContexts, GrpoLearner]:
     source = ToyContexts(load_base(), CONFIG)
-    return source, GrpoLearner(source.network, CONFIG.grpo, rollout_settings(CONFIG.rollout), seed=CONFIG.seed)
+    return source, GrpoLearner(source.network, CONFIG.grpo, CONFIG.rollout, seed=CONFIG.seed)
 
 
 def test_each_buffer_is_sampled_by_the_newest_weights_scored_and_trained_on() -> None:

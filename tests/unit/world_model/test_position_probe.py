@@ -9,11 +9,10 @@ from pushing_scene import episode, success
 from wm_nodes.config.load import load_config
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model.position_probe import PositionProbe
-from wm_nodes.world_model.tokenizer import PROBE_NAMES
+from wm_nodes.world_model.positions import columns_of, probe_targets
 from wm_nodes.world_model.training.position_probe import train_position_probe
-from wm_nodes.world_model.training.tokenizer import probe_targets
 
-OBJECT = [PROBE_NAMES.index(name) for name in ("object_x", "object_y")]
+OBJECT = columns_of("push_cube", "object")
 
 
 def arrays(count: int, first_seed: int = 0) -> EpisodeArrays:

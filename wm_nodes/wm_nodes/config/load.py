@@ -20,7 +20,7 @@ from wm_nodes.config.video import VideoRlConfig
 PRESETS = resources.files("wm_nodes.config") / "presets"
 POLICY, VIDEO = "policy", "video"
 """Folders of presets, one for each loop."""
-FREE = ("behaviours", "rewards", "extra_body")
+FREE = ("behaviours", "rewards", "extra_body", "kwargs")
 """Mappings without fixed keys, which are replaced as a whole."""
 FORMER_NAMES = {"gate": "acceptance", "rounds": "model_refresh"}
 """Sections of configurations saved before they were renamed."""

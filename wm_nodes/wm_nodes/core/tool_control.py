@@ -8,7 +8,7 @@ from torch import Tensor
 
 from wm_nodes.core.action_spaces import POSE
 from wm_nodes.core.rotations import multiply, to_quaternion, to_vector
-from wm_nodes.core.specs import EnvironmentSpec, of_columns
+from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import FloatArray
 
 
@@ -24,41 +24,39 @@ def next_state(states: FloatArray, actions: FloatArray, spec: EnvironmentSpec) -
     A state that starts outside the box (a reset pose may) is not pulled in by a zero action.
     """
     scale = np.asarray(spec.action_scale, np.float32)
-    moved = _moved_pose(np, states, scale * actions) if moves_pose(spec) else states + scale * actions
-    if spec.state_low:
-        low = np.minimum(np.asarray(spec.state_low, np.float32), states)
-        high = np.maximum(np.asarray(spec.state_high, np.float32), states)
-        moved = np.clip(moved, low, high)
-    return moved.astype(np.float32)
-
-
-def next_commanded(states: FloatArray, actions: FloatArray, spec: EnvironmentSpec) -> FloatArray:
-    """next_state of the commanded values; the measured ones stay as they are, for a model to say how they change."""
-    kept = commanded_columns(spec)
-    if kept and not spec.measured:
-        return next_state(states, actions, spec)
-    moved = states.astype(np.float32)
-    if kept:
-        moved[..., kept] = next_state(states[..., kept], actions, of_columns(spec, kept))
+    box = np.asarray((spec.state_low, spec.state_high), np.float32) if spec.state_low else None
+    moved: FloatArray = _moved(np, states, scale * actions, box, pose=moves_pose(spec)).astype(np.float32)
     return moved
 
 
-def commanded_columns(spec: EnvironmentSpec) -> list[int]:
-    """Which values of a state are not measured."""
-    return [i for i in range(spec.state_dim) if i not in spec.measured]
+class CommandedMove:
+    """next_state, to the bit, of tensors on one device; the measured values stay as they are, for a model to say how
+    they change."""
+
+    def __init__(self, spec: EnvironmentSpec, device: torch.device) -> None:
+        commanded = [i for i in range(spec.state_dim) if i not in spec.measured]
+        self._columns = torch.tensor(commanded, dtype=torch.int64).to(device)
+        self._scale = torch.tensor(spec.action_scale, dtype=torch.float32).to(device)
+        box = torch.tensor((spec.state_low, spec.state_high), dtype=torch.float32)
+        self._box = box[:, commanded].to(device) if spec.state_low else None
+        self._pose, self._whole = moves_pose(spec), bool(commanded) and not spec.measured
+
+    def __call__(self, states_NS: Tensor, actions_NA: Tensor) -> Tensor:
+        """States (N, S) after actions (N, A)."""
+        if not len(self._columns):
+            return states_NS
+        given = states_NS if self._whole else states_NS[:, self._columns]
+        moved: Tensor = _moved(torch, given, self._scale * actions_NA, self._box, pose=self._pose)
+        return moved if self._whole else states_NS.index_copy(1, self._columns, moved)
 
 
-def next_state_tensor(
-    states_NS: Tensor, actions_NA: Tensor, scale_A: Tensor, box_2S: Tensor | None, *, pose: bool = False
-) -> Tensor:
-    """next_state, to the bit, of tensors on one device. scale_A: the spec's action_scale. box_2S: state_low and
-    state_high; None: no box. pose: moves_pose(spec)."""
-    moved = _moved_pose(torch, states_NS, scale_A * actions_NA) if pose else states_NS + scale_A * actions_NA
-    if box_2S is None:
+def _moved(xp: Any, states: Any, changes: Any, box: Any, *, pose: bool) -> Any:
+    """States (..., S) after changes (..., A) in their units. box: (2, S), least and largest; None: no limits. xp: numpy
+    or torch."""
+    moved = _moved_pose(xp, states, changes) if pose else states + changes
+    if box is None:
         return moved
-    return torch.minimum(
-        torch.maximum(moved, torch.minimum(box_2S[0], states_NS)), torch.maximum(box_2S[1], states_NS)
-    )
+    return xp.minimum(xp.maximum(moved, xp.minimum(box[0], states)), xp.maximum(box[1], states))
 
 
 def _moved_pose(xp: Any, states: Any, changes: Any) -> Any:

@@ -18,7 +18,7 @@ from wm_nodes.config.load import load_video_config
 from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.nodes.clip_evaluator_node import read_buffer
 from wm_nodes.nodes.learner.training_node import TrainingNode, run_learner
-from wm_nodes.ros import convert, diagnostics
+from wm_nodes.ros import diagnostics
 from wm_nodes.ros.actions import GuardedActionClient
 from wm_nodes.ros.clients import run_goal, same_process
 from wm_nodes.ros.endpoint_matching import StartBarrier
@@ -200,10 +200,9 @@ def with_scores(buffer: RolloutBuffer, scores: ClipScores) -> RolloutBuffer:
     count, names = len(buffer), list(scores.names)
     if scores.num_clips != count or len(scores.total) != count or len(scores.values) != count * len(names):
         raise RolloutBufferError(f"scores of {scores.num_clips} clips for a buffer of {count}; judge this buffer")
-    values = torch.from_numpy(convert.from_field(scores.values, np.float64).reshape(len(names), count).copy())
-    total = torch.from_numpy(convert.from_field(scores.total, np.float64).copy())
-    valid = torch.from_numpy(convert.from_field(scores.valid, np.uint8).copy()).bool()
-    return attach_rewards(buffer, dict(zip(names, values, strict=True)), torch.where(valid, total, torch.nan))
+    values = torch.from_numpy(np.array(scores.values, np.float64).reshape(len(names), count))
+    total, valid = (torch.from_numpy(np.array(field, np.float64)) for field in (scores.total, scores.valid))
+    return attach_rewards(buffer, dict(zip(names, values, strict=True)), torch.where(valid > 0, total, torch.nan))
 
 
 def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> VideoRun:

@@ -19,11 +19,16 @@ from wm_nodes.core.device import explain_memory
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Environment, Rollout
 from wm_nodes.policy_rl.image_policy import ImagePolicy
-from wm_nodes.policy_rl.rollouts import action_noise, check_whole_groups, collect_rollout, reset_seeds
-from wm_nodes.policy_rl.tensor_rollout import TensorRollout
+from wm_nodes.policy_rl.rollouts import (
+    TensorRollout,
+    action_noise,
+    check_whole_groups,
+    collect_rollout,
+    reset_seeds,
+)
 from wm_nodes.reward import EncoderDistance, EndogenousReward, RewardModel
-from wm_nodes.world_model.device_environment import DeviceEnvironment
-from wm_nodes.world_model.imagined_episodes import start_of
+from wm_nodes.world_model import DeviceEnvironment
+from wm_nodes.world_model.starts import start_of
 
 MOST_HASHED_STARTS = 1024
 WARM_UP_STEPS = 3
@@ -141,8 +146,7 @@ class DeviceCollector:
         columns["features"][-1].copy_(self._features())
         columns["states"][-1].copy_(env.states_NP)
         rewards, rewarded = self._rewards(columns)
-        if not bool(env.finite):
-            raise FloatingPointError("the world model predicted NaN; its weights are damaged or were trained too hot")
+        env.check_finite()
         features, states = columns["features"], columns["states"]
         return TensorRollout(
             features[:-1], features[1:], states[:-1], states[1:], columns["actions"], columns["logprobs"],
@@ -189,36 +193,27 @@ class DeviceCollector:
 
     def _rewards(self, columns: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Rewards (T, N), NaN where there is none, and where there is one: EndogenousReward.evaluate."""
-        config, signal, spread = self._reward.config, columns["signal"], columns["uncertainty"]
+        reward, signal, spread = self._reward, columns["signal"], columns["uncertainty"]
         valid = columns["valid"] & torch.isfinite(signal) & torch.isfinite(spread)
-        crossed = signal > config.success_threshold
-        if config.uncertainty_limit > 0:
-            crossed = crossed & (spread <= config.uncertainty_limit)
-        rewards = config.sparse_weight * crossed.float()
+        rewards = reward.config.sparse_weight * reward.crossed(signal, spread).float()
         if self._goals is not None:
             goals, found = self._goals
-            dense = config.dense_weight * self._dense(columns["features"], goals[columns["starts"]])
+            features = columns["features"][..., : goals.shape[-1]]  # without positions
+            wanted = goals[columns["starts"]]
+            before, after = (_distance_of(reward).between(f, wanted) for f in (features[:-1], features[1:]))
+            dense = reward.config.dense_weight * reward.approach(before, after)
             valid = valid & found[columns["starts"]] & torch.isfinite(dense)
             rewards = dense + rewards
         return torch.where(valid, rewards, float("nan")), valid
-
-    def _dense(self, features: Tensor, goals_TNF: Tensor) -> Tensor:
-        scale = _distance_of(self._reward).scale
-        features = features[..., : goals_TNF.shape[-1]]  # without positions
-        after, before = (1 - (f - goals_TNF).abs().mean(-1) / scale for f in (features[1:], features[:-1]))
-        if self._reward.config.mode == "abs":
-            return after
-        limit = self._reward.config.dense_clip
-        return (after - before).clamp(-limit, limit)
 
     def _encode_goals(self) -> tuple[Tensor, Tensor] | None:
         """Features (M, F) and found flags (M,) of the starts' goals; None where the reward needs no goal."""
         if self._reward.config.dense_weight == 0:
             return None
-        if self.env.goals is None:
+        if (goals := self.env.goals()) is None:
             raise ValueError("reward.dense_weight needs goals, and this environment was made without; set it to 0")
-        frames, found = self.env.goals
-        features = _distance_of(self._reward).encode(frames).flatten(1)
+        frames, found = goals
+        features = _distance_of(self._reward).encode(frames)
         return features.to(self.env.device), torch.from_numpy(found).to(self.env.device)
 
 

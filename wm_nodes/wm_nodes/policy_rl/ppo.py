@@ -23,8 +23,7 @@ from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.advantages import GroupAdvantages, explained_variance, gae, group_advantages, masked_normalise
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.losses import approximate_kl, clip_fraction, clipped_policy_loss, value_loss
-from wm_nodes.policy_rl.rollouts import Canceled, check_whole_groups
-from wm_nodes.policy_rl.tensor_rollout import TensorRollout, tensors_of
+from wm_nodes.policy_rl.rollouts import Canceled, TensorRollout, check_whole_groups, tensors_of
 from wm_nodes.training import checkpoint
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import check_same_layout

@@ -1,22 +1,25 @@
-"""Collects rollouts in lock-step inside one process (RS-9), step for step as the graph does over DDS.
+"""Rollouts: collected in lock-step inside one process (RS-9), step for step as the graph does over DDS; as the tensors
+that a learner computes with; and their statistics.
 
-Shapes: T time, N environments. An environment that has ended is reset in the next lock-step instead of stepped, so that
-column of the rollout is invalid there. Seeds of resets and action noise depend on (seed, policy version, lock-step)
-only.
+An environment that has ended is reset in the next lock-step instead of stepped, so that column of the rollout is
+invalid there. Seeds of resets and action noise depend on (seed, policy version, lock-step) only.
+
+Shapes: T time, N environments, F features, S state, A action, H W 3 image.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from wm_nodes.config.seed_ranges import EVALUATION
+from wm_nodes.core.lockstep import LockStep
 from wm_nodes.core.seeding import numpy_stream, torch_stream
-from wm_nodes.core.types import BoolArray, Environment, FloatArray, Rollout, UInt8Array, UInt64Array
+from wm_nodes.core.types import BoolArray, Environment, FloatArray, Rollout, StepResult, UInt8Array, UInt64Array
 from wm_nodes.policy_rl.image_policy import ImagePolicy
-from wm_nodes.policy_rl.tensor_rollout import Outcomes, TensorRollout
 from wm_nodes.reward import RewardInput, RewardModel
 
 
@@ -25,22 +28,101 @@ class Canceled(Exception):
 
 
 @dataclass(frozen=True)
+class TensorRollout:
+    """T lock-steps of N environments, as Rollout, on one device, with a policy's features in place of pictures."""
+
+    features_TN: Tensor
+    """float32 (T, N, F), of the observations that the actions answer."""
+    next_features_TN: Tensor
+    """float32 (T, N, F), of the observations that the steps reached; they count only where needs_bootstrap()."""
+    states_TN: Tensor
+    """float32 (T, N, S)."""
+    next_states_TN: Tensor
+    """float32 (T, N, S); they count as next_features_TN does."""
+    actions_TN: Tensor
+    """float32 (T, N, A), executed."""
+    logprobs_TN: Tensor
+    """float32 (T, N), nats; NaN where unknown."""
+    values_TN: Tensor
+    """float32 (T, N), the critic's; NaN where unknown."""
+    rewards_TN: Tensor
+    """float32 (T, N), NaN where there is none."""
+    terminated_TN: Tensor
+    """bool (T, N), the task is over."""
+    truncated_TN: Tensor
+    """bool (T, N), cut by time or disagreement."""
+    valid_TN: Tensor
+    """bool (T, N), a step was made and has a reward."""
+    policy_version: int
+    """The learner step whose weights acted."""
+    images: Tensor | None = None
+    """uint8 (T + 1, N, H, W, 3), what the environments showed before every step and after the last; None where the
+    pictures were never here."""
+
+    def needs_bootstrap(self) -> Tensor:
+        """Where (T, N) the value of the observation that a step reached is no other row's: at cuts, before a missing
+        step, and at the end."""
+        return _needs_bootstrap(self.valid_TN, self.terminated_TN, self.truncated_TN)
+
+    def pictures(self, envs: slice = slice(None)) -> UInt8Array:
+        """Copy pictures (T + 1, n, H, W, 3) of the environments `envs` to the host. Raises ValueError without any."""
+        if self.images is None:
+            raise ValueError("this rollout has no pictures; its Rollout holds them")
+        pictures: UInt8Array = self.images[:, envs].cpu().numpy()
+        return pictures
+
+
+@torch.no_grad()
+def tensors_of(rollout: Rollout | TensorRollout, policy: ImagePolicy) -> TensorRollout:
+    """The rollout with the features of `policy`, on its device; those of reached observations only where needed. One
+    that is there already is returned as it is."""
+    if isinstance(rollout, TensorRollout):
+        return rollout
+
+    def tensor(array: NDArray[Any]) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(policy.device)
+
+    steps, num_envs = rollout.valid_TN.shape
+    flags = (torch.from_numpy(flag) for flag in (rollout.valid_TN, rollout.terminated_TN, rollout.truncated_TN))
+    needed = np.flatnonzero(_needs_bootstrap(*flags).numpy())  # on the host, which need not ask the device
+    images, reached = (i.reshape(-1, *i.shape[2:]) for i in (rollout.images_TN, rollout.next_images_TN))
+    features = policy.features(images)
+    following = torch.zeros_like(features)
+    following[tensor(needed)] = policy.features(reached[needed])
+    shape = (steps, num_envs, -1)
+    return TensorRollout(
+        features.view(shape), following.view(shape), tensor(rollout.states_TN), tensor(rollout.next_states_TN),
+        tensor(rollout.actions_TN), tensor(rollout.logprobs_TN), tensor(rollout.values_TN),
+        tensor(rollout.rewards_TN), tensor(rollout.terminated_TN), tensor(rollout.truncated_TN),
+        tensor(rollout.valid_TN), rollout.policy_version,
+    )
+
+
+def _needs_bootstrap(valid_TN: Tensor, terminated_TN: Tensor, truncated_TN: Tensor) -> Tensor:
+    next_lost_TN = torch.ones_like(valid_TN)
+    next_lost_TN[:-1] = ~valid_TN[1:]
+    return valid_TN & ~terminated_TN & (truncated_TN | next_lost_TN)
+
+
+@dataclass(frozen=True)
 class RolloutStatistics:
     """Of each environment's first episode, which began with the rollout. NaN means that none ended inside it.
 
     A later episode has less time: it would be counted where it succeeds early, and not where it fails.
-
-    episodes: that ended inside the rollout; mean_return and mean_length (steps) are theirs. successes: of them, those
-    that terminated (the environment's own done signal). begun: all of them. cut: episodes, first or later, that the
-    rollout's end cut short.
     """
 
     episodes: int
+    """First episodes that ended inside the rollout."""
     successes: int
+    """Of these, those that terminated (the environment's own done signal)."""
     mean_return: float
+    """Of the ended ones."""
     mean_length: float
+    """Of the ended ones, steps."""
     begun: int
+    """All first episodes."""
     cut: int
+    """Episodes, first or later, that the rollout's end cut short."""
 
     @property
     def success_rate(self) -> float:
@@ -54,15 +136,14 @@ class RolloutStatistics:
 
 @dataclass
 class Convergence:
-    """Says when training has converged (ppo.converged_updates).
-
-    wanted: updates in a row in whose rollouts no episode fails; 0: never. unfailed: those up to the newest update.
-    """
+    """Says when training has converged (ppo.converged_updates)."""
 
     wanted: int
+    """Updates in a row in whose rollouts no episode fails; 0: never."""
     unfailed: int = 0
+    """Those up to the newest update."""
 
-    def reached(self, rollout: Outcomes | TensorRollout) -> bool:
+    def reached(self, rollout: Rollout | TensorRollout) -> bool:
         """Count the rollout of one more update; return whether training has converged."""
         self.unfailed = rollout_statistics(rollout).unfailed_after(self.unfailed)
         return 0 < self.wanted <= self.unfailed
@@ -139,19 +220,8 @@ def collect_rollout(
     return Rollout(policy_version=policy_version, **{name: np.stack(rows) for name, rows in columns.items()})
 
 
-class StepOutcome(Protocol):
-    """What StepResult and recording.lockstep.RecordedStep say of a lock-step; see StepResult."""
-
-    @property
-    def success_probability(self) -> FloatArray: ...
-    @property
-    def valid(self) -> BoolArray: ...
-    @property
-    def uncertainty(self) -> FloatArray: ...
-
-
 def reward_input(
-    images: UInt8Array, next_images: UInt8Array, step: StepOutcome, goals: tuple[UInt8Array, BoolArray] | None
+    images: UInt8Array, next_images: UInt8Array, step: StepResult | LockStep, goals: tuple[UInt8Array, BoolArray] | None
 ) -> RewardInput:
     """Return what a reward model needs of one lock-step. goals: env.goals() as of before the step."""
     frames, known = goals if goals is not None else (None, None)
@@ -170,23 +240,32 @@ def terminate_at_episode_end(rollout: Rollout) -> Rollout:
     return replace(rollout, terminated_TN=ended, truncated_TN=np.zeros_like(ended))
 
 
-def rollout_statistics(rollout: Outcomes | TensorRollout) -> RolloutStatistics:
+def rollout_statistics(rollout: Rollout | TensorRollout) -> RolloutStatistics:
     """Return counts and means of the first episodes of the rollout, see RolloutStatistics.
 
     The return of an episode with an invalid step in its middle leaves that step out.
     """
-    if isinstance(rollout, TensorRollout):
-        rollout = rollout.outcomes()
-    ended_TN = rollout.terminated_TN | rollout.truncated_TN
+    rewards_TN, terminated_TN, truncated_TN, valid_TN = _outcomes(rollout)
+    ended_TN = terminated_TN | truncated_TN
     ended_N = ended_TN.any(0)
     first_TN: BoolArray = np.cumsum(ended_TN, 0) - ended_TN == 0
-    returns_N = np.where(first_TN & rollout.valid_TN, rollout.rewards_TN, 0.0).sum(0, dtype=np.float64)
-    lengths_N = (first_TN & (rollout.valid_TN | ended_TN)).sum(0)
-    successes, episodes = int((first_TN & rollout.terminated_TN).sum()), int(ended_N.sum())
-    begun = int((ended_N | rollout.valid_TN.any(0)).sum())
+    returns_N = np.where(first_TN & valid_TN, rewards_TN, 0.0).sum(0, dtype=np.float64)
+    lengths_N = (first_TN & (valid_TN | ended_TN)).sum(0)
+    successes, episodes = int((first_TN & terminated_TN).sum()), int(ended_N.sum())
+    begun = int((ended_N | valid_TN.any(0)).sum())
     last_TN: BoolArray = np.cumsum(ended_TN[::-1], 0)[::-1] == 0
-    cut = int((last_TN & rollout.valid_TN).any(0).sum())
+    cut = int((last_TN & valid_TN).any(0).sum())
     if not episodes:
         return RolloutStatistics(0, 0, float("nan"), float("nan"), begun, cut)
     mean_return, mean_length = (float(column[ended_N].mean()) for column in (returns_N, lengths_N))
     return RolloutStatistics(episodes, successes, mean_return, mean_length, begun, cut)
+
+
+def _outcomes(rollout: Rollout | TensorRollout) -> tuple[FloatArray, BoolArray, BoolArray, BoolArray]:
+    """Rewards, terminated, truncated and valid (T, N) on the host."""
+    if isinstance(rollout, Rollout):
+        return rollout.rewards_TN, rollout.terminated_TN, rollout.truncated_TN, rollout.valid_TN
+    columns = rollout.rewards_TN, rollout.terminated_TN, rollout.truncated_TN, rollout.valid_TN
+    rewards, *flags = torch.stack([column.float() for column in columns]).cpu().numpy()  # in one copy
+    terminated, truncated, valid = (flag.astype(np.bool_) for flag in flags)
+    return rewards, terminated, truncated, valid

@@ -19,13 +19,13 @@ import numpy as np
 import torch.distributed
 
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.lockstep import DroppedTransitions
 from wm_nodes.core.model_folder import read_json
 from wm_nodes.core.named_files import CHECKPOINT, read_regular
 from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.ppo import PpoLearner
-from wm_nodes.policy_rl.rollouts import Canceled, rollout_statistics, terminate_at_episode_end
-from wm_nodes.policy_rl.tensor_rollout import TensorRollout
+from wm_nodes.policy_rl.rollouts import Canceled, TensorRollout, rollout_statistics, terminate_at_episode_end
 from wm_nodes.training.checkpoint import RESTORE, DamagedFileError
 from wm_nodes.training.ranks import Ranks, broadcast_rollout
 from wm_nodes.training.run_folder import TrainingRun, VersionFiles
@@ -34,20 +34,12 @@ from wm_nodes.training.weights import PackedWeights, load_weights, pack_weights
 POLICY_FILES = VersionFiles("policies/policy")
 
 
-@dataclass(frozen=True)
-class DroppedTransitions:
-    """Transitions (single environments' steps) left out of a rollout, by reason."""
-
-    invalid: int = 0
-    gap: int = 0
-    stale: int = 0
-
-
 class Learner(Protocol):
-    """What the learner node needs of an algorithm; ppo.PpoLearner is one."""
+    """What training needs of an algorithm; ppo.PpoLearner is one, learner.factory names another."""
 
-    def update(self, rollout: Rollout, *, should_stop: Callable[[], bool] | None = None) -> Any:
-        """Train on one rollout; return metrics, a mapping or a dataclass of numbers.
+    def update(self, rollout: Rollout | TensorRollout, *, should_stop: Callable[[], bool] | None = None) -> Any:
+        """Train on one rollout, of another learner than PPO a Rollout; return metrics, a mapping or a dataclass of
+        numbers.
 
         Raises rollouts.Canceled when should_stop returned True, and FloatingPointError when a loss, gradient or weight
         is not finite; the weights are then as they were before.

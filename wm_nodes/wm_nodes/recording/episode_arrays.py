@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.config.tasks import parts_of, shares_scene, success, task_names
+from wm_nodes.config.tasks import has_rule, parts_of, shares_scene, success
 from wm_nodes.core.types import BoolArray, Episode, FloatArray, UInt8Array
 
 TaskLabels = Callable[[str, FloatArray], BoolArray]
@@ -101,7 +101,7 @@ def stack_episodes(
 ) -> EpisodeArrays:
     """Stack episodes of one camera set-up; longer ones are cut to num_steps (None: the longest decides).
 
-    A task without a file is done where its recorded episodes say so; `labels` are those of the other tasks.
+    A task without a rule in its file is done where its recorded episodes say so; `labels` are those of the other tasks.
 
     Raises:
         ValueError: no episodes, episodes of different image, state or action sizes, or as check_finite.
@@ -124,7 +124,7 @@ def stack_episodes(
         actions[row, : lengths[row]] = episode.actions[: lengths[row]]
     truth = np.stack([e.ground_truth[rows] for e, rows in zip(listed, frame_rows, strict=True)])
     said = np.stack([e.success[rows] for e, rows in zip(listed, frame_rows, strict=True)])
-    with_rule = set(tasks) if labels is not success else set(tasks) & set(task_names())
+    with_rule = set(tasks) if labels is not success else {*filter(has_rule, tasks)}
     return EpisodeArrays(
         images=np.stack([e.images[rows] for e, rows in zip(listed, frame_rows, strict=True)]),
         states=np.stack([s[rows] for s, rows in zip(tool_states, frame_rows, strict=True)]), actions=actions,

@@ -38,7 +38,8 @@ class SuccessRate:
 class Summary:
     """The results of a run.
 
-    real_, imagined_: success before and after training, in the simulator and in the world model.
+    real_, imagined_: success before and after training, in evaluation.environment and in the world model; None where
+        evaluation.environment is none.
     imagined_steps_per_s: environment steps of the training in the world model, per second of training.
     bag: path of the recorded training, in the file relative to the run folder.
     paired, imagined_paired: after minus before on the same seeds, with the keys difference, low and high (and more);
@@ -58,8 +59,8 @@ class Summary:
     task: str
     preset: str
     seed: int
-    real_before: SuccessRate
-    real_after: SuccessRate
+    real_before: SuccessRate | None
+    real_after: SuccessRate | None
     imagined_before: SuccessRate
     imagined_after: SuccessRate
     imagined_steps_per_s: float

@@ -65,8 +65,11 @@ class EncoderDistance:
 
     def __call__(self, images: UInt8Array, others: UInt8Array) -> FloatArray:
         check_pair(images, others)
-        distance_N = (self._features(images) - self._features(others)).abs().flatten(1).mean(1) / self.scale
-        return distance_N.cpu().numpy()
+        return self.between(self._features(images), self._features(others)).cpu().numpy()
+
+    def between(self, features: Tensor, others: Tensor) -> Tensor:
+        """The distance (...,) of features (..., F), as encode gives them."""
+        return (features - others).abs().mean(-1) / self.scale
 
     @torch.no_grad()
     def _features(self, images: UInt8Array) -> Tensor:
@@ -82,12 +85,12 @@ class EncoderDistance:
 
     @torch.no_grad()
     def encode(self, images: UInt8Array) -> Tensor:
-        """Features (N, F), in batches of one size, the last one filled up, so that an image's features do not depend on
-        how many others were new: a recorded reward is computed again bit by bit."""
+        """Features float32 (N, F), in batches of one size, the last one filled up: those of an image do not depend on
+        how many others were new, and a recorded reward is computed again bit by bit."""
         missing = -len(images) % BATCH
         filled = np.concatenate([images, np.zeros((missing, *images.shape[1:]), np.uint8)])
         parts = [self.encoder(torch.from_numpy(filled[i : i + BATCH])).float() for i in range(0, len(filled), BATCH)]
-        return torch.cat(parts)[: len(images)]
+        return torch.cat(parts)[: len(images)].flatten(1)
 
 
 def check_pair(images: UInt8Array, others: UInt8Array) -> None:

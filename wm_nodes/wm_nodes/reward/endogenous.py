@@ -1,9 +1,10 @@
 """The world model's own reward: goal distance plus done signal (RS-5, RS-7, RS-8). Shapes: N environments, K frames."""
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from wm_nodes.config.schema import RewardConfig
 from wm_nodes.core.types import BoolArray, FloatArray
@@ -17,6 +18,8 @@ from wm_nodes.reward.base import (
     version_of,
 )
 from wm_nodes.reward.distances import Distance
+
+_Array = TypeVar("_Array", NDArray[Any], Tensor)
 
 
 class EndogenousReward:
@@ -61,14 +64,27 @@ class EndogenousReward:
             reasons[f"no {what}"] = missing
         unknown = ~np.isfinite(step.success_probability) | ~np.isfinite(step.uncertainty)
         reasons["success probability or uncertainty is not finite"] = unknown
-        crossed = step.success_probability > config.success_threshold
-        if config.uncertainty_limit > 0:
-            crossed &= step.uncertainty <= config.uncertainty_limit
+        crossed = self.crossed(step.success_probability, step.uncertainty)
         success = np.where(unknown, SUCCESS_UNKNOWN, np.where(crossed, SUCCESS_YES, SUCCESS_NO)).astype(np.uint8)
         return assemble(
             np.float32(config.dense_weight) * dense, np.float32(config.sparse_weight) * crossed.astype(np.float32),
             step, success, reasons, {"dense": config.dense_weight, "sparse": config.sparse_weight},
         )
+
+    def crossed(self, signal: _Array, uncertainty: _Array) -> _Array:
+        """Where the sparse reward is paid (bool), of arrays or of tensors."""
+        crossed = signal > self._config.success_threshold
+        if self._config.uncertainty_limit > 0:
+            crossed = crossed & (uncertainty <= self._config.uncertainty_limit)
+        return crossed
+
+    def approach(self, before: _Array, after: _Array) -> _Array:
+        """The unweighted dense reward of the modes delta and abs, of the distances to the goal before and after the
+        step; arrays or tensors."""
+        if self._config.mode == "abs":
+            return 1 - after
+        limit = self._config.dense_clip
+        return ((1 - after) - (1 - before)).clip(-limit, limit)
 
     def _dense(self, step: RewardInput) -> tuple[FloatArray, BoolArray]:
         """Return unweighted dense rewards (N,) and where the goal is missing; rewards are 0 there and where invalid."""
@@ -86,11 +102,9 @@ class EndogenousReward:
     def _goal(self, step: RewardInput, rows: NDArray[np.intp]) -> FloatArray:
         assert step.goals is not None  # checked by _dense
         goals = step.goals[rows]
-        after: FloatArray = 1 - self._distance(step.next_images[rows], goals)
-        if self._config.mode == "abs":
-            return after
-        before = 1 - self._distance(step.images[rows], goals)
-        return self._clip(after - before)
+        after = self._distance(step.next_images[rows], goals)
+        before = after if self._config.mode == "abs" else self._distance(step.images[rows], goals)
+        return self.approach(before, after)
 
     def _progress(self, step: RewardInput, rows: NDArray[np.intp]) -> FloatArray:
         assert step.golden is not None and step.golden_lengths is not None  # checked by _dense and RewardInput
@@ -103,9 +117,5 @@ class EndogenousReward:
             distances = self._distance(np.repeat(images, num_frames, axis=0), frames).reshape(-1, num_frames)
             nearest = np.where(beyond, np.inf, distances).argmin(1)
             progress.append(nearest / (lengths - 1))
-        return self._clip(progress[1] - progress[0])
-
-    def _clip(self, change: NDArray[Any]) -> FloatArray:
         limit = self._config.dense_clip
-        clipped: FloatArray = change.clip(-limit, limit).astype(np.float32)
-        return clipped
+        return (progress[1] - progress[0]).clip(-limit, limit).astype(np.float32)

@@ -4,7 +4,7 @@ import time
 from dataclasses import dataclass, field
 
 from wm_msgs.msg import ErrorCode
-from wm_nodes.ros.wire import WireError
+from wm_nodes.core.errors import WireError
 
 MAX_NUMBER = 2**64 - 1
 """Largest value of the fields session and seq."""

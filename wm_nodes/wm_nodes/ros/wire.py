@@ -5,19 +5,8 @@ Shapes: N environments, A action, S state, P ground truth, H W 3 image. Stamps i
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from wm_nodes.core.errors import RunError
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array, UInt64Array
-
-
-class WireError(Exception):
-    """A refused request: code is one of wm_msgs/ErrorCode, the text names the value and the remedy."""
-
-    def __init__(self, code: int, text: str) -> None:
-        super().__init__(text)
-        self.code = code
 
 
 class PeerLost(RunError):
@@ -85,58 +74,6 @@ class TimedAction:
     policy_version: int = 0
     logprobs: FloatArray | None = None
     values: FloatArray | None = None
-
-
-@dataclass(frozen=True)
-class Transition:
-    """TransitionBatch. ground_truth: (N, P), or (N, 0) where unknown."""
-
-    stamp_ns: int
-    next_stamp_ns: int
-    step_id: int
-    actions: FloatArray
-    states: FloatArray
-    next_states: FloatArray
-    logprobs: FloatArray
-    values: FloatArray
-    terminated: BoolArray
-    truncated: BoolArray
-    valid: BoolArray
-    episode_ids: UInt64Array
-    episode_steps: NDArray[np.uint32]
-    policy_versions: UInt64Array
-    success_probability: FloatArray
-    uncertainty: FloatArray
-    ground_truth: FloatArray
-    source: int
-    session: int = 0
-
-    @property
-    def is_reset(self) -> bool:
-        """True for the transition that env/reset publishes: no action, both stamps those of the first frame."""
-        return self.stamp_ns == self.next_stamp_ns
-
-
-@dataclass(frozen=True)
-class Rewards:
-    """What a learner reads of a RewardBatch; arrays (N,)."""
-
-    transition_session: int
-    step_id: int
-    total: FloatArray
-    valid: BoolArray
-    success: UInt8Array
-    invalid_reason: str
-
-
-@dataclass(frozen=True)
-class Goals:
-    """TaskGoal. images: (N, H, W, 3), or None where the environment has no goals. found: bool (N,)."""
-
-    stamp_ns: int
-    images: UInt8Array | None
-    found: BoolArray
-    episode_ids: UInt64Array
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from wm_nodes.config.load import load_video_config
 from wm_nodes.config.schema import RewardConfig, VideoEnvironmentConfig
 from wm_nodes.core.seeding import stream_seed
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.video_model.conditions import Condition, hashed_words
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_model.sampling import RolloutSettings, initial_noise, sample_videos
-from wm_nodes.world_model.imagined_episodes import ImaginedEpisodes, imagined_spec
+from wm_nodes.video_model.sampling import initial_noise, sample_videos
+from wm_nodes.world_model.imagined_episodes import DeviceEpisodes, ImaginedEpisodes, imagined_spec, put_where
 from wm_nodes.world_model.parts import in_parallel
 from wm_nodes.world_model.precision import compute_context
 
@@ -32,54 +33,50 @@ class DoneSignal(Protocol):
     def read(self, frames: Tensor) -> FloatArray: ...
 
 
-class VideoEnvironment(ImaginedEpisodes):
-    """N imagined environments in lock-step, one sampled frame per step.
+class VideoEpisodes(DeviceEpisodes):
+    """Imagined episodes of a video model, one sampled frame per step. The done signal is that of `reader`; nothing
+    estimates its uncertainty, which is 0, and no goals are imagined. Arguments as VideoEnvironment's."""
 
-    The initial noise of a frame comes from the stream (seed of the reset, `video_step`, step), so an episode is the
-    same in any batch; on a CPU bit for bit. The done signal is that of `reader`; nothing estimates its uncertainty,
-    which is 0, and no goals are imagined.
-
-    Args:
-        spec, starts, reward: as ImaginedEpisodes's; the spec is that of the simulator the model was learned from.
-        settings: of the sampler, an ODE.
-        exact: compute in float32 even where bfloat16 is faster.
-
-    Raises:
-        ValueError: a model that cannot be stepped, or of another task or robot; starts of another picture size.
-    """
+    kind = "video model"
 
     def __init__(
         self, folder: VideoFolder, reader: DoneSignal, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray],
-        reward: RewardConfig, settings: VideoEnvironmentConfig, *, num_envs: int, seed: int = 0, exact: bool = False,
+        reward: RewardConfig, settings: VideoEnvironmentConfig, *, num_envs: int, exact: bool,
     ) -> None:
         check_steppable(folder, spec)
-        assert folder.lengths is not None  # checked
         device = folder.device
-        super().__init__(
-            imagined_spec(spec, f"video/{spec.task}", folder.sha256, num_envs), starts, reward, seed=seed, device=device
-        )
+        super().__init__(imagined_spec(spec, f"video/{spec.task}", folder.sha256, num_envs), starts, reward, device)
         self.folder, self._reader, self._exact = folder, reader, exact
         self._rows = ROWS if device.type == "cpu" else num_envs
-        self._sampler = RolloutSettings(settings.num_steps, settings.shift, micro_batch=self._rows)
+        self._sampler = load_video_config("base").rollout.with_values(
+            num_steps=settings.num_steps, shift=settings.shift, micro_batch=self._rows
+        )
         self._start_latents = folder.codec.encode(torch.from_numpy(starts[0]).unsqueeze(1)).to(device)
+        self.latent_shape = tuple(self._start_latents.shape[1:])
         self._text = hashed_words((spec.instruction,), folder.network.settings.text_dim).to(device)
-        most = folder.lengths.given
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        super().begin_anew()
+        assert self.folder.lengths is not None  # checked
+        num_envs, most = self.spec.num_envs, self.folder.lengths.given
         # newest last; of the oldest, only the newest _num_given are of the present episode
         self._given = self._start_latents[:1].repeat(num_envs, 1, most, 1, 1)
-        self._acted = torch.zeros(num_envs, most, spec.action_dim, device=device)
+        self._acted = torch.zeros(num_envs, most, self.spec.action_dim, device=self.device)
         self._num_given = np.ones(num_envs, np.int64)
 
-    def _begin(self, mask: BoolArray) -> None:
-        rows = self._tensor(np.flatnonzero(mask))
-        self._given[rows, :, -1:] = self._start_latents[self._tensor(self._starts[mask])]
-        self._num_given[mask] = 1
+    def _begin(self, begins_N: Tensor) -> None:
+        rows = begins_N.nonzero()[:, 0]
+        self._given[rows, :, -1:] = self._start_latents[self.starts_N[rows]]
+        self._num_given[rows.cpu().numpy()] = 1
 
     def _predict(
-        self, actions: FloatArray, moved: FloatArray, valid: BoolArray
-    ) -> tuple[UInt8Array, FloatArray, FloatArray]:
-        acted = torch.cat([self._acted[:, 1:], self._tensor(actions).unsqueeze(1)], 1)
-        noise = self._noise(valid)
-        calls = self._calls(valid)
+        self, actions_NA: Tensor, moved_NP: Tensor, valid_N: Tensor, noise: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """noise: (N, C, 1, h, w), the initial noise of the next frames."""
+        assert noise is not None
+        acted = torch.cat([self._acted[:, 1:], actions_NA.unsqueeze(1)], 1)
+        calls = self._calls(valid_N.cpu().numpy())
 
         def sample(rows: Tensor) -> tuple[Tensor, Tensor, FloatArray]:
             K = int(self._num_given[int(rows[0])])
@@ -92,20 +89,18 @@ class VideoEnvironment(ImaginedEpisodes):
             pictures = self.folder.codec.decode(made).squeeze(1)
             return made, pictures, self._reader.read(pictures)
 
-        shown, signal = self._shown.copy(), np.zeros(len(valid), np.float32)
+        frames, signal = self.frames_NHWC.clone(), torch.zeros(len(valid_N), device=self.device)
         latents = self._given[:, :, -1:].clone()
         for rows, (made, pictures, done) in zip(calls, in_parallel(sample, calls), strict=True):
             latents[rows] = made  # rows that fill up a call are written twice, with the same
-            shown[rows.cpu().numpy()], signal[rows.cpu().numpy()] = pictures.cpu().numpy(), done
-        if not torch.isfinite(latents).all():
-            raise FloatingPointError("the video model predicted NaN; its weights are damaged or were trained too hot")
-        stepped = self._tensor(valid)
-        given = torch.cat([self._given[:, :, 1:], latents], 2)
-        self._given = torch.where(stepped[:, None, None, None, None], given, self._given)
-        self._acted = torch.where(stepped[:, None, None], acted, self._acted)
-        most = self._given.shape[2]
-        self._num_given = np.where(valid, np.minimum(self._num_given + 1, most), self._num_given)
-        return shown, signal, np.zeros_like(signal)
+            frames[rows], signal[rows] = pictures, torch.from_numpy(done).to(self.device)
+        self.finite.logical_and_(torch.isfinite(latents).all())
+        stepped = valid_N & self.finite
+        put_where(stepped, self._given, torch.cat([self._given[:, :, 1:], latents], 2))
+        put_where(stepped, self._acted, acted)
+        self._num_given += stepped.cpu().numpy()
+        np.minimum(self._num_given, self._given.shape[2], out=self._num_given)
+        return frames, signal, torch.zeros_like(signal)
 
     def _calls(self, valid: BoolArray) -> list[Tensor]:
         """The rows of each call of the models: of as many given frames; on a CPU always ROWS of them."""
@@ -114,16 +109,41 @@ class VideoEnvironment(ImaginedEpisodes):
             rows = np.flatnonzero(valid & (self._num_given == K))
             if self.device.type == "cpu":
                 rows = np.concatenate([rows, np.full(-len(rows) % self._rows, rows[0])])
-            calls += torch.split(self._tensor(rows), self._rows)  # type: ignore[no-untyped-call]
+            calls += torch.split(torch.from_numpy(rows).to(self.device), self._rows)  # type: ignore[no-untyped-call]
         return calls
 
-    def _noise(self, valid: BoolArray) -> Tensor:
-        """Initial noise (N, C, 1, h, w) of the next frames; where not `valid`, any."""
+
+class VideoEnvironment(ImaginedEpisodes):
+    """The NumPy face of VideoEpisodes: N imagined environments in lock-step.
+
+    The initial noise of a frame comes from the stream (seed of the reset, `video_step`, step), so an episode is the
+    same in any batch; on a CPU bit for bit.
+
+    Args:
+        spec, starts, reward: as DeviceEpisodes's; the spec is that of the simulator the model was learned from.
+        settings: of the sampler, an ODE.
+        exact: compute in float32 even where bfloat16 is faster.
+
+    Raises:
+        ValueError: a model that cannot be stepped, or of another task or robot; starts of another picture size.
+    """
+
+    episodes: VideoEpisodes
+
+    def __init__(
+        self, folder: VideoFolder, reader: DoneSignal, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray],
+        reward: RewardConfig, settings: VideoEnvironmentConfig, *, num_envs: int, seed: int = 0, exact: bool = False,
+    ) -> None:
+        super().__init__(
+            VideoEpisodes(folder, reader, spec, starts, reward, settings, num_envs=num_envs, exact=exact), seed=seed
+        )
+
+    def _noise(self) -> Tensor:
         seeds = [
-            stream_seed(int(seed), "video_step", int(step)) if needed else 0
-            for seed, step, needed in zip(self._seeds, self._steps, valid, strict=True)
+            stream_seed(int(seed), "video_step", int(step))
+            for seed, step in zip(self._seeds, self._steps(), strict=True)
         ]
-        return initial_noise(tuple(self._start_latents.shape[1:]), torch.tensor(seeds)).to(self.device)
+        return initial_noise(self.episodes.latent_shape, torch.tensor(seeds)).to(self.device)
 
 
 def check_steppable(folder: VideoFolder, spec: EnvironmentSpec) -> None:

@@ -11,7 +11,6 @@ from wm_nodes.config.load import load_video_config
 from wm_nodes.core.device import compute_device
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner
-from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.video_rl.toy_scene import ToyContexts, draw_scenes, load_base
 
 Request = TypeVar("Request")
@@ -49,7 +48,7 @@ def main() -> None:
     changes = {"groups.contexts": 6, "groups.shared_noise": True, "rollout.shift": 3.0, "rollout.sampler.arm": "cps"}
     config = load_video_config("base", {**changes, "grpo.learning_rate": 1e-4, "grpo.logprob_weight": "cps"})
     source = ToyContexts(load_base(device=compute_device(config.device)), config)
-    learner = GrpoLearner(source.network, config.grpo, rollout_settings(config.rollout), seed=config.seed)
+    learner = GrpoLearner(source.network, config.grpo, config.rollout, seed=config.seed)
     for iteration, (_, report) in enumerate(post_train(learner, source, 20), 1):
         obeyed = source.evaluate(draw_scenes(100, config.seed, "evaluation")).obeyed.mean()
         print(f"buffer {iteration}: training reward {report.reward_mean:.2f}; {obeyed:.0%} of held-out clips obey")

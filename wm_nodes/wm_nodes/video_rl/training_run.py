@@ -25,7 +25,6 @@ from wm_nodes.training.weights import PackedWeights, save_weights
 from wm_nodes.video_model import RolloutBuffer, VideoNetwork
 from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner
 from wm_nodes.video_rl.reward_hacking import HackedMetric
-from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.video_rl.validation import SECTION, HeldoutScores, alarm_scalars, find_hacked_now
 
 CHECKPOINT = "checkpoints/video_learner.safetensors"
@@ -72,8 +71,7 @@ class VideoRun(TrainingRun):
         self.network, self.config, self._heldout = network, config, heldout
         self._training = threading.Lock()
         self.learner = GrpoLearner(
-            network, config.grpo, rollout_settings(config.rollout), seed=config.seed, ranks=ranks,
-            reward_weights=config.rewards,
+            network, config.grpo, config.rollout, seed=config.seed, ranks=ranks
         )
         self.iterations = 0
         """Buffers trained on in the run folder."""

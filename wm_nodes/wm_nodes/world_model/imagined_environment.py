@@ -1,9 +1,12 @@
-"""The world model behind the Environment interface: the policy's training ground (RS-9).
+"""The world model as the policy's training ground (RS-9): a device program, and its face behind the Environment
+interface.
 
-Shapes: N environments, M starts, S tokens, D values per token, A action, P state.
+Shapes: N environments, M starts, S tokens, D values per token, A action, P state, H W 3 image.
 """
 
+import copy
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,12 +18,17 @@ from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.world_model.dynamics import ActionModel, task_done_signal
 from wm_nodes.world_model.folder import WorldModels
-from wm_nodes.world_model.imagined_episodes import ImaginedEpisodes, imagined_spec, task_indices
+from wm_nodes.world_model.imagined_episodes import (
+    DeviceEpisodes,
+    ImaginedEpisodes,
+    imagined_spec,
+    put_where,
+    task_indices,
+)
 from wm_nodes.world_model.parts import in_parallel, parts_of
-from wm_nodes.world_model.precision import compute_context, copy_in_bfloat16, has_fast_bfloat16
+from wm_nodes.world_model.precision import copy_in_bfloat16, has_fast_bfloat16
 from wm_nodes.world_model.text import imagine_goals
 from wm_nodes.world_model.token_dynamics import TokenActionModel
-from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.transformer import RingCache, SpatioTemporalTransformer
 
 GOAL_BATCH = 64
@@ -29,26 +37,13 @@ CachedPart = tuple[slice, list[RingCache]]
 """The rows of a part of the batch, and the history of their environments."""
 
 
-def cached_parts(trunk: SpatioTemporalTransformer, batch: int, device: torch.device) -> list[CachedPart]:
-    """The parts of a batch, each with caches that start empty."""
-    return [(rows, trunk.new_ring_caches(rows.stop - rows.start, device)) for rows in parts_of(batch, device)]
-
-
-def world_model_spec(models: WorldModels, spec: EnvironmentSpec, num_envs: int) -> EnvironmentSpec:
-    """The spec of the simulator as that of `models`, which stand in for it."""
-    return imagined_spec(spec, f"wm/{spec.task}", models.sha256, num_envs)
-
-
-def models_to_infer(models: WorldModels, *, exact: bool) -> tuple[Tokenizer, ActionModel | TokenActionModel]:
-    """Tokenizer and action model with their weights cast once for compute_context; the same bits."""
-    if not has_fast_bfloat16(models.tokenizer.device):
-        return models.tokenizer, models.action
-    return copy_in_bfloat16(models.tokenizer), models.action if exact else copy_in_bfloat16(models.action)
-
-
-def encode_starts(models: WorldModels, images: UInt8Array) -> Tensor:
-    """Latents (M, S, D) of first frames (M, H, W, 3)."""
-    return torch.cat([models.tokenizer.encode(images[i : i + 256]) for i in range(0, len(images), 256)])
+def cached_parts(
+    trunk: SpatioTemporalTransformer, batch: int, device: torch.device, *, fixed: bool | None = None
+) -> list[CachedPart]:
+    """The parts of a batch, each with caches that start empty. fixed: see RingTimes."""
+    return [
+        (rows, trunk.new_ring_caches(rows.stop - rows.start, device, fixed=fixed)) for rows in parts_of(batch, device)
+    ]
 
 
 def imagine_start_goals(
@@ -72,69 +67,29 @@ def imagine_start_goals(
     return np.concatenate([part.goals for part in parts]), np.concatenate([part.found for part in parts])
 
 
-class ModelRollouts:
-    """What one action model imagines for N environments; latents: (N, S, D), of the newest frames.
+@dataclass(frozen=True)
+class ImaginedLatents:
+    """What one action model imagines, changed in place."""
+
+    model: ActionModel | TokenActionModel
+    """With its weights cast once for the type that it computes in."""
+    latents_NSD: Tensor
+    """float32, of the newest frames."""
+    parts: list[CachedPart]
+    """On a CPU a thread computes each; see parts.py."""
+
+
+class DeviceEnvironment(DeviceEpisodes):
+    """N imagined environments on the models' device.
 
     Args:
-        model: as models_to_infer casts it.
-    """
-
-    def __init__(self, model: ActionModel | TokenActionModel, latents: Tensor, *, exact: bool) -> None:
-        self.latents, self._model, self._exact = latents, model, exact
-        self._parts = cached_parts(model.trunk, len(latents), latents.device)
-
-    def begin(self, begins: Tensor, first: Tensor) -> None:
-        """Begin an episode at latents `first` (N, S, D) where `begins` (N,)."""
-        self.latents = torch.where(begins[:, None, None], first, self.latents)
-        for rows, caches in self._parts:
-            caches[0].restart(begins[rows])
-
-    def next_states(self, acted: Tensor, before: Tensor, commanded: Tensor) -> Tensor:
-        """The states (N, P) that a step reaches, the measured values as the model predicts them."""
-        assert self._model.state_change is not None
-        with compute_context(self.latents.device, exact=self._exact):
-            return self._model.state_change.next_states(self.latents, acted, before, commanded)
-
-    def step(
-        self, acted: Tensor, before: Tensor, after: Tensor, valid: Tensor, show: Callable[[Tensor, slice], Tensor]
-    ) -> tuple[Tensor, Tensor]:
-        """Take the step where `valid`; return the logits of the done heads and show(latents of some rows, rows).
-
-        Raises:
-            FloatingPointError: a latent is NaN.
-        """
-        keep = valid[:, None, None]
-
-        def part(item: CachedPart) -> tuple[Tensor, Tensor, Tensor]:
-            rows, caches = item
-            with compute_context(self.latents.device, exact=self._exact):
-                latents, logits = self._model.advance(
-                    self.latents[rows], acted[rows], before[rows], after[rows], caches
-                )
-            latents = torch.where(keep[rows], latents, self.latents[rows])
-            return latents, logits, show(latents, rows)
-
-        parts = in_parallel(part, self._parts)
-        latents, logits, shown = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
-        if not torch.isfinite(latents).all():
-            raise FloatingPointError("the world model predicted NaN; its weights are damaged or were trained too hot")
-        self.latents = latents
-        return logits, shown
-
-
-class ImaginedEnvironment(ImaginedEpisodes):
-    """N imagined environments in lock-step. An episode terminates when the done signal exceeds
-    reward.success_threshold (RS-7), and is truncated at the step limit or above reward.uncertainty_limit.
-
-    Args:
-        spec, starts, reward: as ImaginedEpisodes's; the spec is that of the simulator the model was learned from.
+        spec, starts, reward: as DeviceEpisodes's; the spec is that of the simulator the model was learned from.
         instructions: of every start, for its goal; none: that of the spec.
         with_goals: imagine goals by the text model (needed for the dense reward).
         exact: compute in float32 even where bfloat16 is faster.
-        picture_noise: standard deviation of noise on the latents of shown frames, of the stream picture_noise of
-            (episode's reset seed, environment, step); the model goes on without it.
         second: another model of the same tokenizer and tasks; the lower done signal of both counts, and their
             difference as disagreement.
+        fixed: see RingTimes; by default on all devices but the CPU.
 
     Raises:
         ValueError: a second model with another tokenizer, or with other tasks.
@@ -142,74 +97,162 @@ class ImaginedEnvironment(ImaginedEpisodes):
 
     def __init__(
         self, models: WorldModels, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray], reward: RewardConfig,
-        *, num_envs: int, seed: int = 0, instructions: Sequence[str] = (), with_goals: bool = True,
-        exact: bool = False, picture_noise: float = 0.0, second: WorldModels | None = None,
+        *, num_envs: int, instructions: Sequence[str] = (), with_goals: bool = True, exact: bool = False,
+        second: WorldModels | None = None, fixed: bool | None = None,
     ) -> None:
-        super().__init__(
-            world_model_spec(models, spec, num_envs), starts, reward, seed=seed, device=models.tokenizer.device
-        )
-        self.models, self.instructions, self._exact = models, instructions, exact
-        self.picture_noise, self.second = picture_noise, second
+        device = models.tokenizer.device
+        super().__init__(imagined_spec(spec, f"wm/{spec.task}", models.sha256, num_envs), starts, reward, device)
         if second and (second.tokenizer_sha256, second.tasks) != (models.tokenizer_sha256, models.tasks):
             raise ValueError(
                 "imagined_environment.second_model has another tokenizer or other tasks than the world model; refresh "
                 "that model (--rounds), or leave it empty"
             )
-        self._start_tasks = task_indices(starts[1], spec, models.task_index)
-        self._tokenizer, action = models_to_infer(models, exact=exact)
-        images, _ = starts
-        self._start_latents = encode_starts(models, images)
+        self.tokenizer_sha256 = models.tokenizer_sha256
+        self._fast, self._exact, self._fixed = has_fast_bfloat16(device), exact, fixed
+        self._tokenizer = copy_in_bfloat16(models.tokenizer) if self._fast else models.tokenizer
+        self._models = [
+            copy_in_bfloat16(each.action) if self._fast and not exact else each.action
+            for each in (models, *([second] if second else []))
+        ]
+        images, states = starts
+        self._start_latents = torch.cat(
+            [models.tokenizer.encode(images[i : i + 256]) for i in range(0, len(images), 256)]
+        ).clone()
+        self._start_tasks = torch.from_numpy(task_indices(states, spec, models.task_index)).to(device)
         self._goals = imagine_start_goals(models, starts, self.spec, reward, instructions) if with_goals else None
-        first = self._start_latents[:1].repeat(num_envs, 1, 1)
-        actions = [action, *([models_to_infer(second, exact=exact)[1]] if second else [])]
-        self._rollouts = [ModelRollouts(model, first, exact=exact) for model in actions]
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        super().begin_anew()
+        num_envs = self.spec.num_envs
+        self.imagined = [
+            ImaginedLatents(
+                model, self._start_latents[:1].repeat(num_envs, 1, 1),
+                cached_parts(model.trunk, num_envs, self.device, fixed=self._fixed),
+            )
+            for model in self._models
+        ]
+
+    @classmethod
+    def beside(cls, environment: "ImaginedEnvironment") -> "DeviceEnvironment":
+        """The same models, starts, rules and number of environments, with a state of its own.
+
+        Raises:
+            ValueError: an environment with picture noise.
+        """
+        if environment.picture_noise:
+            raise ValueError(
+                "device rollouts know no imagined_environment.picture_noise; leave it unset, or leave the rollouts to "
+                "the graph"
+            )
+        program = copy.copy(environment.episodes)
+        program.begin_anew()
+        return program
 
     def goals(self) -> tuple[UInt8Array, BoolArray] | None:
-        if self._goals is None:
-            return None
-        frames, found = self._goals
-        return frames[self._starts], found[self._starts]
+        return self._goals
 
-    def _begin(self, mask: BoolArray) -> None:
-        begins, first = self._tensor(mask), self._start_latents[self._tensor(self._starts)]
-        for rollouts in self._rollouts:
-            rollouts.begin(begins, first)
+    def encode(self, *, positions: bool = False) -> Tensor:
+        """Features (N, F) float32 of the frames shown for a policy: Tokenizer.flatten of Tokenizer.encode."""
+        with self._autocast():
+            latents = self._tokenizer.bottleneck(
+                self._tokenizer.features(self.frames_NHWC.permute(0, 3, 1, 2).float() / 255)
+            )
+            return self._tokenizer.flatten(latents, positions=positions)
 
-    def _move(self, actions: FloatArray) -> FloatArray:
-        moved, tool = super()._move(actions), self.spec.tool_dim
-        if self.spec.measured:
-            inputs = map(self._tensor, (actions, self._states[:, :tool], moved[:, :tool]))
-            moved[:, :tool] = self._rollouts[0].next_states(*inputs).cpu().numpy()
-        return moved
+    def _begin(self, begins_N: Tensor) -> None:
+        for imagined in self.imagined:
+            put_where(begins_N, imagined.latents_NSD, self._start_latents[self.starts_N])
+            for rows, caches in imagined.parts:
+                caches[0].restart(begins_N[rows])
+
+    def _move(self, actions_NA: Tensor) -> Tensor:
+        moved, change, tool = super()._move(actions_NA), self._models[0].state_change, self.spec.tool_dim
+        if change is None:
+            return moved
+        with self._autocast(exact=self._exact):
+            predicted = change.next_states(
+                self.imagined[0].latents_NSD, actions_NA, self.states_NP[:, :tool], moved[:, :tool]
+            )
+        return torch.cat([predicted, moved[:, tool:]], 1)
 
     def _predict(
-        self, actions: FloatArray, moved: FloatArray, valid: BoolArray
-    ) -> tuple[UInt8Array, FloatArray, FloatArray]:
-        tool, noise = self.spec.tool_dim, self._noise()
-        acted, before, after = map(self._tensor, (actions, self._states[:, :tool], moved[:, :tool]))
-        inputs = acted, before, after, self._tensor(valid)
-        tasks = self._tensor(self._start_tasks[self._starts])
+        self, actions_NA: Tensor, moved_NP: Tensor, valid_N: Tensor, noise: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """noise: (N, S, D), on the latents of the shown frames; the model goes on without it."""
+        tasks = self._start_tasks[self.starts_N]
 
         def show(latents: Tensor, rows: slice) -> Tensor:
-            return self._tokenizer.decode(latents if noise is None else latents + noise[rows])
+            with self._autocast():
+                return self._tokenizer.decode_part(latents if noise is None else latents + noise[rows])
 
-        logits, frames = self._rollouts[0].step(*inputs, show)
+        logits, frames = self._advance(self.imagined[0], actions_NA, moved_NP, valid_N, show)
         signal, spread = task_done_signal(logits, tasks)
-        for rollouts in self._rollouts[1:]:
-            logits, _ = rollouts.step(*inputs, lambda latents, rows: latents[:0])
+        for rival in self.imagined[1:]:
+            logits, _ = self._advance(rival, actions_NA, moved_NP, valid_N, lambda latents, rows: latents[:0])
             other, other_spread = task_done_signal(logits, tasks)
             spread = torch.stack([spread, other_spread, (signal - other).abs()]).amax(0)
             signal = torch.minimum(signal, other)
-        told = torch.stack((signal, spread)).cpu()
-        return frames.cpu().numpy(), told[0].numpy(), told[1].numpy()
+        return frames, signal, spread
+
+    def _advance(
+        self, imagined: ImaginedLatents, actions_NA: Tensor, moved_NP: Tensor, valid_N: Tensor,
+        show: Callable[[Tensor, slice], Tensor],
+    ) -> tuple[Tensor, Tensor]:
+        """Imagine the next latents; return the logits of the done heads, and show(latents of some rows, rows)."""
+        before, after = (states[:, : self.spec.tool_dim] for states in (self.states_NP, moved_NP))
+
+        def part(item: CachedPart) -> tuple[Tensor, Tensor, Tensor]:
+            rows, caches = item
+            now = imagined.latents_NSD[rows]
+            with self._autocast(exact=self._exact):
+                latents, logits = imagined.model.advance(now, actions_NA[rows], before[rows], after[rows], caches)
+            latents = torch.where(valid_N[rows, None, None], latents, now)
+            return latents, logits, show(latents, rows)
+
+        parts = imagined.parts
+        results = [part(parts[0])] if len(parts) == 1 else in_parallel(part, parts)
+        latents, logits, shown = results[0] if len(parts) == 1 else (torch.cat(pieces) for pieces in zip(*results))
+        self.finite.logical_and_(torch.isfinite(latents).all())
+        imagined.latents_NSD.copy_(torch.where(self.finite, latents, imagined.latents_NSD))
+        return logits, shown
+
+    def _autocast(self, *, exact: bool = False) -> torch.autocast:
+        """As compute_context; the device was asked once. A captured graph cannot keep a cache of casts."""
+        enabled = self._fast and not exact
+        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=enabled, cache_enabled=False)
+
+
+class ImaginedEnvironment(ImaginedEpisodes):
+    """The NumPy face of a DeviceEnvironment, with its arguments.
+
+    Args:
+        seed: as ImaginedEpisodes's.
+        picture_noise: standard deviation of noise on the latents of shown frames, of the stream picture_noise of
+            (episode's reset seed, environment, step); the model goes on without it.
+    """
+
+    episodes: DeviceEnvironment
+
+    def __init__(
+        self, models: WorldModels, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray], reward: RewardConfig,
+        *, num_envs: int, seed: int = 0, instructions: Sequence[str] = (), with_goals: bool = True,
+        exact: bool = False, picture_noise: float = 0.0, second: WorldModels | None = None,
+    ) -> None:
+        episodes = DeviceEnvironment(
+            models, spec, starts, reward, num_envs=num_envs, instructions=instructions, with_goals=with_goals,
+            exact=exact, second=second,
+        )
+        super().__init__(episodes, seed=seed)
+        self.picture_noise = picture_noise
 
     def _noise(self) -> Tensor | None:
-        """Noise on the shown latents (N, S, D) at this step; None without."""
         if not self.picture_noise:
             return None
         streams = (
             torch_stream(int(seed), "picture_noise", env, int(step))
-            for env, (seed, step) in enumerate(zip(self._seeds, self._steps, strict=True))
+            for env, (seed, step) in enumerate(zip(self._seeds, self._steps(), strict=True))
         )
-        drawn = torch.stack([torch.randn(self._start_latents.shape[1:], generator=stream) for stream in streams])
+        shape = self.episodes.imagined[0].latents_NSD.shape[1:]
+        drawn = torch.stack([torch.randn(shape, generator=stream) for stream in streams])
         return self.picture_noise * drawn.to(self.device)

@@ -29,13 +29,15 @@ class StateChange(nn.Module):
         self.register_buffer("state_mean", torch.zeros(state_dim))
         self.register_buffer("state_scale", torch.ones(state_dim))
         self.register_buffer("change_scale", torch.ones(len(measured)))
+        self.columns: Tensor
+        self.register_buffer("columns", torch.tensor(measured), persistent=False)  # a captured step may not copy it up
 
     @torch.no_grad()
     def fit_scale(self, states_FP: Tensor, changes_FP: Tensor) -> None:
         """Set shift and scale from recorded states (F, P) and their changes (F, P), before any training."""
         self.state_mean.copy_(states_FP.mean(0))
         self.state_scale.copy_(states_FP.std(0, correction=0).clamp_min(1e-3))
-        self.change_scale.copy_(changes_FP[:, self.measured].std(0, correction=0).clamp_min(1e-4))
+        self.change_scale.copy_(changes_FP[:, self.columns].std(0, correction=0).clamp_min(1e-4))
 
     def forward(self, latents_SD: Tensor, actions_A: Tensor, states_P: Tensor) -> Tensor:
         """Change (..., M) in units of change_scale; latents (..., S, D), actions (..., A), states (..., P)."""
@@ -46,10 +48,9 @@ class StateChange(nn.Module):
     def next_states(self, latents_SD: Tensor, actions_A: Tensor, states_P: Tensor, commanded_P: Tensor) -> Tensor:
         """States (..., P) after the step: commanded_P with the measured values that are predicted."""
         change = self(latents_SD, actions_A, states_P) * self.change_scale
-        columns = torch.tensor(self.measured, device=states_P.device)
-        return commanded_P.index_copy(-1, columns, states_P[..., self.measured] + change)
+        return commanded_P.index_copy(-1, self.columns, states_P[..., self.columns] + change)
 
     def wanted(self, states_P: Tensor, next_states_P: Tensor) -> Tensor:
         """What forward should have given for recorded states before and after."""
-        changed: Tensor = (next_states_P - states_P)[..., self.measured] / self.change_scale
+        changed: Tensor = (next_states_P - states_P)[..., self.columns] / self.change_scale
         return changed

@@ -6,11 +6,12 @@ They do not pass the topics: env/image, env/transition and reward stay silent, a
 from collections.abc import Callable
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.lockstep import DroppedTransitions
 from wm_nodes.core.types import Environment
 from wm_nodes.nodes.factories import make_reward
 from wm_nodes.policy_rl.device_rollout import DeviceCollector
-from wm_nodes.policy_rl.tensor_rollout import TensorRollout
-from wm_nodes.policy_rl.training_run import DroppedTransitions, PolicyTraining
+from wm_nodes.policy_rl.rollouts import TensorRollout
+from wm_nodes.policy_rl.training_run import PolicyTraining
 from wm_nodes.ros.clients import Check
 from wm_nodes.world_model import DeviceEnvironment, ImaginedEnvironment
 
@@ -29,7 +30,7 @@ class DeviceRollouts:
         self.left_out: list[str] = []
 
     def begin(
-        self, check: Check, training: PolicyTraining, config: RunConfig, model_dir: str, learner_factory: str
+        self, check: Check, training: PolicyTraining, config: RunConfig, model_dir: str
     ) -> "DeviceRollouts":
         """Be the source of a goal. check: as ReplayedRollouts's.
 
@@ -39,8 +40,8 @@ class DeviceRollouts:
         environment = self._environment()
         if not isinstance(environment, ImaginedEnvironment):
             raise ValueError("device rollouts need an environment with backend world_model in the same process")
-        if learner_factory:
-            raise ValueError(f"learner_factory is {learner_factory}, and device rollouts are for PPO; leave out one")
+        if factory := config.learner.factory:
+            raise ValueError(f"learner.factory is {factory}, and device rollouts are for PPO; leave out one")
         if self._collector is None or self._made_for != (environment, training.policy):
             reward = make_reward("endogenous", config, model_dir)
             self._collector = DeviceCollector(DeviceEnvironment.beside(environment), training.policy, reward)
