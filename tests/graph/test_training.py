@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from graph import toy
 from graph.harness import Graph, Probe, own_domain, wait_until
+from graph.reinforce import make_reinforce
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from model_folders import make_model_folder
@@ -18,7 +20,10 @@ from wm_msgs.action import Replay, Train
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import GetWeights, InferAction, SaveCheckpoint, StopRecording
 from wm_nodes.config.load import load_config
+from wm_nodes.policy_rl.train import train_policy
+from wm_nodes.reward import RuleReward
 from wm_nodes.ros import convert
+from wm_nodes.training.weights import unpack_weights
 
 pytestmark = pytest.mark.graph
 
@@ -76,11 +81,13 @@ GROUPS = {"ppo.advantage": "group", "ppo.group_size": 2, "ppo.num_steps": 12, "p
 """GRPO, with noise so large that some episodes of a group reach and others do not."""
 
 
-def _run(folder: Path, updates: int, *, forks: bool = True, settings: dict[str, Any] | None = None) -> dict[str, str]:
+def _run(
+    folder: Path, updates: int, *, forks: bool = True, settings: dict[str, Any] | None = None, **learner: str
+) -> dict[str, str]:
     with own_domain() as domain:
         graph, probe = Graph(domain, folder, load_config("smoke", settings), forks=forks), Probe(domain)
         try:
-            graph.start_training_nodes()
+            graph.start_training_nodes(**learner)
             assert train(probe, updates=updates).termination_reason == Train.Result.FINISHED
         finally:
             probe.close()
@@ -102,6 +109,19 @@ def test_the_graph_gives_the_weights_of_policy_rl_train_bit_for_bit(settings: di
     assert len(graph_weights) == 3
     file = tmp_path / "graph" / "policies" / "policy_000003.safetensors"
     toy.assert_trained_in_one_process(file, updates=2, settings=settings)
+
+
+def test_a_learner_that_is_not_ppo_trains_and_resumes_over_dds_as_in_one_process(tmp_path: Path) -> None:
+    for updates in (2, 1):
+        _run(tmp_path, updates, learner_factory="reinforce:make_reinforce")
+    config = load_config("smoke", {"ppo.num_envs": 4, "ppo.updates": 3})
+    policy, environment = toy.make_policy(config), toy.ReachToy(4, seed=0)
+    learner = make_reinforce(policy, config)
+    for _ in train_policy(policy, environment, RuleReward(config.reward.sparse_weight), config, learner=learner):
+        pass
+    found, _ = unpack_weights((tmp_path / "policies" / "policy_000004.safetensors").read_bytes())
+    for name, tensor in policy.state_dict().items():
+        assert torch.equal(found[name], tensor), name
 
 
 def recorded_training(graph: Graph, probe: Probe, updates: int) -> Path:

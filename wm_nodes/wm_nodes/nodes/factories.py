@@ -13,7 +13,7 @@ from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.core.specs import EnvironmentSpec, SpecMismatch, agree
 from wm_nodes.core.types import Environment
 from wm_nodes.policy_rl.image_policy import ImagePolicy
-from wm_nodes.policy_rl.training_run import Learner
+from wm_nodes.policy_rl.learner import Learner
 from wm_nodes.reward import RewardModel
 from wm_nodes.ros.wire import WireError
 from wm_nodes.training.ranks import Ranks

@@ -49,7 +49,7 @@ PARAMS = (
     Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
     Param("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir",
           read_only=True),
-    Param("learner_factory", "", "module:callable(policy, config) -> Learner instead of PPO, policy_rl.training_run",
+    Param("learner_factory", "", "module:callable(policy, config) -> Learner instead of PPO, see policy_rl.learner",
           read_only=True),
     Param("initial_policy", "", "Weights (safetensors) to start from, where the run folder has no checkpoint",
           read_only=True),
@@ -212,8 +212,7 @@ class LearnerNode(TrainingNode):
             return ReplayedRollouts(self, check, progress, self._replayed, self._replay, uris, num_steps=num_steps)
         if self._device_rollouts is not None:
             self._reward_name = "endogenous"
-            named = str(self.param("model_dir")), str(self.param("learner_factory"))
-            return self._device_rollouts.begin(check, self._training, self._config, *named)
+            return self._device_rollouts.begin(check, self._training, self._config, str(self.param("model_dir")))
         return LiveRollouts(
             self, work, check, progress, self._assembler, self._rollouts, num_steps=num_steps, seed=self._config.seed
         )

@@ -1,9 +1,9 @@
-"""Loop 1 on one screen: PPO or GRPO of a policy in an environment, in one process; the ROS graph gives the same weights
-bit for bit. `python -m wm_nodes.policy_rl.train [--device cuda]`: a policy learns to reach in the shipped world model.
-"""
+"""Loop 1 on one screen: PPO, GRPO or another learner of a policy, in one process; the ROS graph gives the same weights
+bit for bit. `python -m wm_nodes.policy_rl.train [--device cuda]`: learn to reach in the shipped world model."""
 
 import argparse
 from collections.abc import Iterator
+from typing import Any
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
@@ -15,7 +15,8 @@ from wm_nodes.policy_rl.exploit_meter import ExploitMeter
 from wm_nodes.policy_rl.factories import make_endogenous_reward, make_policy, make_training_environment
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import STARTS
-from wm_nodes.policy_rl.ppo import PpoLearner, PpoMetrics
+from wm_nodes.policy_rl.learner import Learner
+from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.rollouts import Convergence, TensorRollout, rollout_statistics
 from wm_nodes.reward import RewardModel
 from wm_nodes.world_model import DeviceEnvironment
@@ -23,10 +24,10 @@ from wm_nodes.world_model import DeviceEnvironment
 
 def train_policy(
     policy: ImagePolicy, env: Environment | DeviceEnvironment, reward: RewardModel, config: RunConfig,
-    meter: ExploitMeter | None = None,
-) -> Iterator[tuple[Rollout | TensorRollout, PpoMetrics]]:
+    meter: ExploitMeter | None = None, learner: Learner | None = None,
+) -> Iterator[tuple[Rollout | TensorRollout, Any]]:
     """Train `policy` in place for ppo.updates updates, or until `meter` stops it or it converged; yield each update."""
-    learner = PpoLearner(policy, config.ppo, seed=config.seed)
+    learner = learner or PpoLearner(policy, config.ppo, seed=config.seed)
     collect = make_collector(env, policy, reward, config.ppo.envs_per_start)  # act, step, reward
     num_steps = config.ppo.num_steps * config.ppo.num_envs // env.spec.num_envs  # however many step at a time
     versions, convergence = range(1, config.ppo.updates + 1), Convergence(config.ppo.converged_updates)
