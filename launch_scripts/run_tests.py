@@ -2,12 +2,13 @@
 with a browser, which only the tests of pages need.
 
 python3 launch_scripts/run_tests.py            # everything
-python3 launch_scripts/run_tests.py --fast     # without the tests marked slow
+python3 launch_scripts/run_tests.py --fast     # without the tests marked slow or alone
 python3 launch_scripts/run_tests.py tests/unit -k setup    # other arguments go to pytest; the checks still run
 python3 launch_scripts/run_tests.py --device cuda          # only the tests of a CUDA device, on the GPU that is here
 
-Tests run two at a time, those with deadlines after the others. A graph test that fails so, or that hangs inside DDS, is
-run once more by itself, which the output says: deadlines are promised where nothing else keeps the machine busy.
+Tests run three at a time and those with deadlines after them, four at a time: graphs wait more than they compute.
+A graph test that fails so, or that hangs inside DDS, is run once more by itself, which the output says: deadlines are
+promised where nothing else keeps the machine busy.
 """
 
 import json
@@ -15,6 +16,7 @@ import os
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from setup import system
@@ -22,39 +24,43 @@ from setup.entry import ensure, interruptible
 
 ROOT = Path(__file__).resolve().parents[1]
 FAILED, CRASHED = (Path(".pytest_cache/v") / name for name in ("cache/lastfailed", "wm/crashed"))
-MOST_AGAIN = 24
+MOST_AGAIN = 8
 """More failed tests than this are no accident: neither of their neighbours, nor of a process that hung inside DDS."""
 MOST_CRASHES = 2
 """After more ended processes pytest-xdist stops, and tests are left out."""
-BY_FILE = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder", f"--max-worker-restart={MOST_CRASHES}")
+BY_FILE = ("-n3", "--dist", "loadfile", "--no-loadscope-reorder", f"--max-worker-restart={MOST_CRASHES}")
 LONG_FIRST = ("tests/graph", "tests/parity", "tests/unit", "tests/contracts")
 WITH_DEADLINES = ("tests/graph",)  # tests/conftest.py sees to it that there are no others
+CHECKS = {
+    "ruff": ("ruff", "check", "."), "mypy --strict": ("mypy",), "import contracts": ("lint-imports", "--no-cache"),
+}
 
 
 def main(argv):
-    """Run the checks, then pytest, whose closing lines come last. Return 0 if all passed."""
-    fast = ["not slow"] if "--fast" in argv else []
+    """Run the checks, and pytest beside them where it runs every test. Return 0 if all passed."""
     named = [text for text in argv if text != "--fast"]
+    fast = ["not slow"] if "--fast" in argv else []
     if any(text.split("=")[0] == "--device" for text in named):
         return _pytest(["-m", " and ".join(["device", *fast]), *named])
-    scripts = Path(sys.prefix) / "bin"
-    checks = {
-        "ruff": [str(scripts / "ruff"), "check", "."],
-        "mypy --strict": [str(scripts / "mypy")],
-        "import contracts": [str(scripts / "lint-imports"), "--no-cache"],
-    }
-    failed = [name for name, command in checks.items() if not _passes(name, command)]
     system.install(system.browser_plan(system.find_browser(), system.read_os_release()), ROOT / ".venv_setup.log")
+    with ThreadPoolExecutor() as beside:
+        passed = beside.map(_passes, CHECKS)
+        if named:
+            passed = list(passed)
+        code = _pytest(["-m", " and ".join(fast), *named]) if named else _every_test(fast)
+        failed = [name for name, well in zip(CHECKS, passed) if not well]
     if failed:
-        print(f"failed before the tests: {', '.join(failed)}", flush=True)
-    if named:
-        return _pytest(["-m", " and ".join(fast), *named]) or int(bool(failed))
+        print(f"failed beside the tests: {', '.join(failed)}", flush=True)
+    return code or int(bool(failed))
+
+
+def _every_test(fast):
+    """Run the tests without deadlines, then, unless `fast`, those with them, and once more what failed."""
     forget()
-    codes = [
-        _pytest(["-m", " and ".join(["not alone", *fast]), *BY_FILE, *LONG_FIRST]),
-        _pytest(["-m", " and ".join(["alone", *fast]), *BY_FILE, *WITH_DEADLINES]),
-    ]
-    return (repeated() if max(codes) == 1 else max(codes)) or int(bool(failed))
+    codes = [_pytest(["-m", " and ".join(["not alone", *fast]), *BY_FILE, *LONG_FIRST])]
+    if not fast:
+        codes.append(_pytest(["-m", "alone", *BY_FILE, "-n4", *WITH_DEADLINES]))
+    return repeated() if max(codes) == 1 else max(codes)
 
 
 def forget():
@@ -81,10 +87,12 @@ def _pytest(arguments):
     ).returncode
 
 
-def _passes(name, command):
-    start = time.monotonic()
+def _passes(name):
+    """Whether one of CHECKS finds nothing; what it says is printed once it has ended."""
+    start, (program, *arguments) = time.monotonic(), CHECKS[name]
     done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, encoding="utf-8", errors="replace", check=False, env=_environment()
+        [str(Path(sys.prefix) / "bin" / program), *arguments], cwd=ROOT, capture_output=True, encoding="utf-8",
+        errors="replace", check=False, env=_environment(),
     )
     print(f"{name}: {'passed' if done.returncode == 0 else 'FAILED'} ({time.monotonic() - start:.0f} s)", flush=True)
     if done.returncode:
@@ -93,10 +101,15 @@ def _passes(name, command):
 
 
 def _environment():
-    """This host only, no repeated tests, one thread per process unless told otherwise; tests pick the ROS domain."""
+    """This host only, no repeated tests, one thread per process unless told otherwise; tests pick the ROS domain.
+
+    Compiled modules are kept, whatever the user's shell says: some hundred processes import torch, which takes one that
+    compiles it anew three times as long.
+    """
     env = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     env.setdefault("OMP_NUM_THREADS", "1")
-    env.pop("WM_TEST_RERUNS", None)
+    for name in ("WM_TEST_RERUNS", "PYTHONDONTWRITEBYTECODE"):
+        env.pop(name, None)
     return env
 
 

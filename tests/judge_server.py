@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from chat_server import ChatServer, Fault
+from deadlines import PATIENCE_S
 
 Server = TypeVar("Server", bound=ChatServer)
 
@@ -49,10 +50,10 @@ def serving(server: Server) -> Iterator[Server]:
 
     thread = threading.Thread(target=loop.run_until_complete, args=(serve(),), name="judge server")
     thread.start()
-    assert ready.wait(10)
+    assert ready.wait(PATIENCE_S)
     try:
         yield server
     finally:
         loop.call_soon_threadsafe(stop.set)
-        thread.join(10)
+        thread.join(PATIENCE_S)
         loop.close()

@@ -29,7 +29,7 @@ class Graph:
     session: int = 7
     reward_lag: int = 3
     start_ns: int = 0
-    """Stamps go on from here by the control period; 0: as in older recordings, where stamps count observations."""
+    """Stamps go on from here by the control period."""
     published: list[tuple[topics.RecordedTopic, Any, int]] = field(default_factory=list)
     rollouts: list[Rollout] = field(default_factory=list)
 

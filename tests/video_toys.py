@@ -11,17 +11,16 @@ from torch import Tensor, nn
 
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.config.video import AdvantageConfig, GrpoConfig, KlConfig
+from wm_nodes.config.video import AdvantageConfig, GrpoConfig, KlConfig, MaskConfig, RolloutConfig, SamplerConfig
 from wm_nodes.judge.one_class.ranges import load_ranges, save_ranges, strides_of
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.video_model import (
     Condition,
     NetworkSettings,
     RolloutBuffer,
-    RolloutSettings,
-    SamplerSettings,
     VideoNetwork,
     config_hash,
+    flow_times,
     initial_noise,
     sample_videos,
 )
@@ -85,7 +84,20 @@ def tiny_network(channels: int = SHAPE[0], *, text_dim: int = 0, seed: int = 0) 
     return network
 
 
-BASE = load_video_config("base").grpo
+PRESET = load_video_config("base")
+BASE = PRESET.grpo
+
+
+def mask_config(**changes: Any) -> MaskConfig:
+    return PRESET.rollout.sampler.mask.with_values(**changes)
+
+
+def sampler_config(arm: str = "dyndiff", eta: float = 0.6, mask: MaskConfig | None = None) -> SamplerConfig:
+    return PRESET.rollout.sampler.with_values(arm=arm, eta=eta, mask=mask or mask_config())
+
+
+def rollout_config(**changes: Any) -> RolloutConfig:
+    return PRESET.rollout.with_values(**changes)
 
 
 def kl_config(*values: Any, **changes: Any) -> KlConfig:
@@ -101,15 +113,19 @@ def grpo_config(**changes: Any) -> GrpoConfig:
     return BASE.with_values(**changes)
 
 
-def toy_rollout_settings(**changes: Any) -> RolloutSettings:
-    """Six steps of shift 3; names that SamplerSettings has go there."""
-    sampler = {name: changes.pop(name) for name in tuple(changes) if name in SamplerSettings.__dataclass_fields__}
-    return RolloutSettings(**{"num_steps": 6, "shift": 3.0, "sampler": SamplerSettings(**sampler), **changes})
+def times_of(settings: RolloutConfig) -> Tensor:
+    return flow_times(settings.num_steps, settings.shift)
+
+
+def toy_rollout_settings(**changes: Any) -> RolloutConfig:
+    """Six steps of shift 3; names that SamplerConfig has go there."""
+    sampler = {name: changes.pop(name) for name in tuple(changes) if name in SamplerConfig.model_fields}
+    return rollout_config(**{"num_steps": 6, "shift": 3.0, "sampler": sampler_config(**sampler), **changes})
 
 
 def toy_buffer(
     model: nn.Module,
-    settings: RolloutSettings,
+    settings: RolloutConfig,
     *,
     groups: int = 2,
     size: int = 4,

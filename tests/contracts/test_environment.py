@@ -1,20 +1,25 @@
 """The contract of core.types.Environment, kept by the simulator, the imagined environment and the benchmark's: where
-the tool only moves, and where it turns and grasps in the procedural scenes, too; and by an arm of somebody else's."""
+the tool only moves, and where it turns and grasps in the procedural scenes, too; and by environments of somebody
+else's: an arm of a file, and one of Gymnasium."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from graph.foreign_arm import ForeignArm
+from drawn_pendulum import SETTINGS as PENDULUM
 from model_folders import make_model_folder
 
 from benchmarks.speed.noop_environment import NoopEnvironment
+from examples import own_environment
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.core.specs import SOURCE_REAL
 from wm_nodes.core.types import Environment, FloatArray, Observation, StepResult
+from wm_nodes.environments.batch import EnvironmentBatch, Frame
 from wm_nodes.environments.maniskill.spec import simulation_spec
+from wm_nodes.environments.registry import make_environment
 from wm_nodes.world_model import ImaginedEnvironment, WorldModels, load_model_folder
 
 N, LIMIT = 2, 3
@@ -27,7 +32,27 @@ def config_of(task: str) -> RunConfig:
     return base.model_copy(update={"simulation": base.simulation.model_copy(update={"max_episode_steps": LIMIT})})
 
 
+OWN = {
+    "arm": {"task": "", "environment.factory": f"{__name__}:make_real_arm"},
+    "pendulum": {**PENDULUM, "gymnasium.kwargs": {"max_episode_steps": LIMIT}},
+}
 CONFIGS = {"": config_of("push_cube"), " of poses": config_of("push")}
+
+
+class RealArm(own_environment.Arm):
+    """Nobody can put it back by a number."""
+
+    _resets = 0
+
+    def reset(self, seed: int) -> Frame:
+        self._resets += 1
+        self._joints = np.full(6, -0.5 - 0.01 * self._resets)
+        return self.step(np.zeros(6, np.float32))
+
+
+def make_real_arm(config: RunConfig, num_envs: int, seed: int) -> EnvironmentBatch:
+    spec = replace(own_environment.SPEC, max_episode_steps=LIMIT)
+    return EnvironmentBatch(spec, [RealArm() for _ in range(num_envs)], seed)
 
 
 def make_simulator(config: RunConfig, seed: int) -> Environment:
@@ -44,7 +69,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, WorldModels]:
 
 
 @pytest.fixture(
-    params=[*(f"{name}{kind}" for kind in CONFIGS for name in ("maniskill", "imagined", "still")), "foreign arm"]
+    params=[*(f"{name}{kind}" for kind in CONFIGS for name in ("maniskill", "imagined", "still")), *OWN]
 )
 def make(request: pytest.FixtureRequest, models: dict[str, WorldModels]) -> Iterator[Make]:
     """Builds the environment under test from a root seed; what it built is closed."""
@@ -56,8 +81,9 @@ def make(request: pytest.FixtureRequest, models: dict[str, WorldModels]) -> Iter
 
     def build(seed: int) -> Environment:
         environment: Environment
-        if name == "foreign":
-            environment = ForeignArm(N, seed, LIMIT)
+        if name in OWN:
+            own = load_config("smoke", OWN[name])
+            environment = make_environment(own, own.environment.factory, num_envs=N, seed=seed)
         elif name == "maniskill":
             environment = make_simulator(config, seed)
         elif name == "imagined":
@@ -82,8 +108,8 @@ def ends(environment: Environment) -> bool:
 
 
 def takes_seeds(environment: Environment) -> bool:
-    """Whether a reset's seed decides what it shows; nobody can put a real arm back by a number."""
-    return not isinstance(environment, ForeignArm)
+    """Whether a reset's seed decides what it shows."""
+    return environment.spec.source != SOURCE_REAL
 
 
 def actions(step: int, environment: Environment) -> FloatArray:

@@ -10,31 +10,35 @@ import sys
 import threading
 import time
 import warnings
+import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any, ClassVar
 
 import rclpy
+from action_msgs.msg import GoalStatusArray
+from deadlines import PATIENCE_S
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph.forked import ForkedNode, fork_node
 from left_over import remove_left_over
 from rclpy.action import ActionClient
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, qos_profile_action_status_default
 
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.errors import WireError
 from wm_nodes.ros.clients import goal_result
 from wm_nodes.ros.endpoint_matching import EndpointTable
 from wm_nodes.ros.qos import topic
-from wm_nodes.ros.wire import WireError
 
-DOMAINS = range(20, 90)
+DOMAINS = range(20, 60)
 PORT, FIRST_PORT, PORTS_PER_DOMAIN = "fastrtps_port", 7400, 250
 """Of Fast DDS: names of files in /dev/shm, and the numbers of DDS."""
 TOY_FOLDER = Path(__file__).parent
-START_S = 60.0
+LOST_S = 5.0
+"""A killed node is reported as lost after so much silence at most."""
 MATCH_S = 0.5
 """A server that has not matched a new client's reader yet loses its answer (rmw_fastrtps 556)."""
 IN_MIDDLEWARE = re.compile(r"Garbage-collecting\n  File \".*/ros/spin\.py\", line \d+ in run_nodes\n")
@@ -67,7 +71,7 @@ def own_domain() -> Iterator[int]:
     raise RuntimeError(f"all domains {DOMAINS} are in use; are test processes left over?")
 
 
-def wait_until(what: str, ready: Callable[[], Any], timeout_s: float = 20.0) -> Any:
+def wait_until(what: str, ready: Callable[[], Any], timeout_s: float = PATIENCE_S) -> Any:
     """Return the first true value of ready(); fail after timeout_s."""
     deadline = time.monotonic() + timeout_s
     while not (value := ready()):
@@ -112,6 +116,28 @@ class Probe:
         time.sleep(MATCH_S)
         return told
 
+    def wait_for_loss(self, reporter: str, lost: str, limit_s: float = LOST_S) -> None:
+        """Wait for a node's report that it lost another; the silence that it names is `limit_s` at most."""
+        said = wait_until(f"a report of {reporter} that {lost} is lost", lambda: self.losses(reporter, lost))[0]
+        assert said <= limit_s, f"{reporter} called {lost} lost after {said:g} s of silence"
+
+    def losses(self, reporter: str, lost: str) -> list[float]:
+        """Seconds of silence in each report of a node that it lost another."""
+        reported = re.compile(rf"{lost} is lost: silent for ([\d.]+) s")
+        return [float(seconds[1]) for text in self.seen_errors[reporter] for seconds in reported.finditer(text)]
+
+    def goals(self, action: str) -> dict[bytes, int]:
+        """State of each goal of an action, a constant of GoalStatus, in the order in which they came."""
+        known = dict[bytes, int]()
+
+        def hear(message: GoalStatusArray) -> None:
+            known.update({bytes(each.goal_info.goal_id.uuid): each.status for each in message.status_list})
+
+        self.node.create_subscription(
+            GoalStatusArray, f"{action}/_action/status", hear, qos_profile_action_status_default
+        )
+        return known
+
     def links(self) -> EndpointTable:
         """A book of what the nodes say of their links from now on; a node restarted before it was reported as lost is
         in use again only when the others have matched its new session."""
@@ -128,13 +154,13 @@ class Probe:
         row = topic(name)
         return self.node.create_publisher(row.type, name, row.qos)
 
-    def call(self, kind: type[Any], name: str, request: Any, timeout_s: float = 20.0) -> Any:
+    def call(self, kind: type[Any], name: str, request: Any, timeout_s: float = PATIENCE_S) -> Any:
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
-            wait_until(f"service {name}", self._clients[name].service_is_ready, START_S)
+            wait_until(f"service {name}", self._clients[name].service_is_ready)
             time.sleep(MATCH_S)
         client = self._clients[name]
-        wait_until(f"service {name}", client.service_is_ready, START_S)
+        wait_until(f"service {name}", client.service_is_ready)
         if timeout_s <= RESEND_S:
             return self.result(client.call_async(request), timeout_s, name)
         sent = [client.call_async(request)]
@@ -149,20 +175,25 @@ class Probe:
     def action(self, kind: type[Any], name: str) -> ActionClient:
         if name not in self._clients:
             self._clients[name] = ActionClient(self.node, kind, name)
-            wait_until(f"action {name}", self._clients[name].server_is_ready, START_S)
+            wait_until(f"action {name}", self._clients[name].server_is_ready)
             time.sleep(MATCH_S)
-        wait_until(f"action {name}", self._clients[name].server_is_ready, START_S)
+        wait_until(f"action {name}", self._clients[name].server_is_ready)
         return self._clients[name]
 
     def send(self, client: ActionClient, goal: Any, feedback: Any = None) -> Any:
         """Send a goal and return its accepted handle."""
-        handle = self.run(lambda: client.send_goal_async(goal, feedback_callback=feedback), 20.0, "goal")
+        handle = self.run(lambda: client.send_goal_async(goal, feedback_callback=feedback), PATIENCE_S, "goal")
         assert handle.accepted
         return handle
 
-    def finish(self, handle: Any, timeout_s: float = 60.0) -> Any:
+    def finish(self, handle: Any, timeout_s: float = PATIENCE_S) -> Any:
         """Wait for a goal's result; return the Result message."""
         return goal_result(handle, timeout_s, lambda: None)
+
+    def cancel(self, handle: Any) -> Any:
+        """Cancel a goal; return the Result message."""
+        self.run(handle.cancel_goal_async, PATIENCE_S, "cancel")
+        return self.finish(handle)
 
     def run(self, send: Callable[[], Any], timeout_s: float, what: str) -> Any:
         """Call `send` in the executor's thread (rclpy's action client races with it otherwise) and wait."""
@@ -218,8 +249,10 @@ class Graph:
     def start(
         self, node: str, namespace: str = "/wm", launcher: tuple[str, ...] | None = None, **params: Any
     ) -> subprocess.Popen[bytes] | ForkedNode:
-        """Fork wm_nodes.nodes.<node>_node, or start python LAUNCHER -m ...; a parameter is given by keyword."""
-        values = {"config_file": self.folder / "config.yaml", "run_dir": self.folder, **params}
+        """Fork wm_nodes.nodes.<node>_node, or start python LAUNCHER -m ...; a parameter is given by keyword, a
+        setting as section__key."""
+        settings = {name: params.pop(name) for name in [*params] if "__" in name}
+        values = {"config_file": self.config_file(**settings), "run_dir": self.folder, **params}
         module, args = f"wm_nodes.nodes.{node}_node", ["--ros-args", "-r", f"__ns:={namespace}"]
         for name, value in values.items():
             args += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
@@ -234,24 +267,35 @@ class Graph:
         self.processes[name] = subprocess.Popen(command, env=self.environment(), stdout=log, stderr=subprocess.STDOUT)
         return self.processes[name]
 
+    def config_file(self, **settings: Any) -> Path:
+        """The run's configuration, or beside it one with changes, as section__key."""
+        run = self.folder / "config.yaml"
+        if not settings:
+            return run
+        text = dump_config(load_config(str(run), {name.replace("__", "."): value for name, value in settings.items()}))
+        path = self.folder / f"config_{zlib.crc32(text.encode()):08x}.yaml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
     def environment(self) -> dict[str, str]:
-        path = os.pathsep.join([str(TOY_FOLDER), *filter(None, [os.environ.get("PYTHONPATH")])])
+        path = os.pathsep.join([str(TOY_FOLDER), str(TOY_FOLDER.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
         return {
             **os.environ, "PYTHONPATH": path, "ROS_DOMAIN_ID": str(self.domain), "OMP_NUM_THREADS": "1",
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": str(self.folder / "ros_log"),
         }
 
     def start_environment(self, factory: str = "toy:make_environment", num_envs: int = 4, **params: Any) -> Any:
-        return self.start("environment", backend="factory", backend_factory=factory, num_envs=num_envs, **params)
+        named = {"backend": "environment", "environment__factory": factory, "num_envs": num_envs}
+        return self.start("environment", **named, **params)
 
     def start_policy(self, **params: Any) -> Any:
-        return self.start("policy", policy_factory="toy:make_policy", **params)
+        return self.start("policy", policy__factory="toy:make_policy", **params)
 
     def start_reward(self, **params: Any) -> Any:
         return self.start("reward_evaluator", reward="rule", **params)
 
     def start_learner(self, **params: Any) -> Any:
-        return self.start("learner", policy_factory="toy:make_policy", **params)
+        return self.start("learner", policy__factory="toy:make_policy", **params)
 
     def start_training_nodes(self, **learner: Any) -> None:
         """environment, policy, reward_evaluator and learner, as in a training run."""
@@ -293,7 +337,7 @@ class Graph:
             book.forget(names[0], lost=True)
             start()
             try:
-                wait_until(f"links of {names[0]}", lambda: not book.missing(names), START_S if last else MATCHED_S)
+                wait_until(f"links of {names[0]}", lambda: not book.missing(names), PATIENCE_S if last else MATCHED_S)
                 time.sleep(MATCH_S)  # for the probe's clients
                 return
             except AssertionError:

@@ -1,4 +1,4 @@
-"""A launch file's graph as a user starts it with ROS 2's Python alone."""
+"""A launch file's graph as a user starts it with ROS 2's Python alone, and the main job as a user starts it."""
 
 import os
 import signal
@@ -11,6 +11,7 @@ from pathlib import Path
 from graph.harness import wait_until
 
 PROGRAM = "import sys; from wm_nodes.launching.runner import main; sys.exit(main(sys.argv[1], sys.argv[2:]))"
+TRAIN_POLICY = "import sys; from wm_nodes.apps.cli import main; sys.exit(main(['train-policy', *sys.argv[1:]]))"
 
 
 @contextmanager
@@ -31,3 +32,9 @@ def launched(scenario: str, given: Sequence[str], log: Path) -> Iterator[None]:
             starter.send_signal(signal.SIGINT)
             code = starter.wait(60)
     assert code == 0, log.read_text(encoding="utf-8")
+
+
+def train_policy(arguments: list[str], domain: int) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "COLUMNS": "160"}
+    command = [sys.executable, "-c", TRAIN_POLICY, "--domain-id", str(domain), *arguments]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)

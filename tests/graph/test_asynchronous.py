@@ -79,7 +79,7 @@ def test_the_policy_acts_on_images_in_real_time_and_says_hold_when_it_stops(grap
     transitions, actions = probe.listen("env/transition"), probe.listen("action")
     graph.start_environment(num_envs=N, mode="asynchronous", control_period_s=0.1, max_action_age_s=2.0)
     policy = graph.start_policy(mode="asynchronous")
-    wait_until("actions", lambda: len(actions) > 10, 60)
+    wait_until("actions", lambda: len(actions) > 10)
     wait_until("steps with them", lambda: sum(not held(t) for t in transitions) > 10)
     stamps = {convert.time_ns(t.next_stamp) for t in transitions}
     assert sum(convert.time_ns(a.header.stamp) in stamps for a in actions) > 5
@@ -127,17 +127,17 @@ def test_no_action_is_published_or_executed_after_an_emergency_stop_until_it_is_
     graph.start_environment(
         "toy:make_long_environment", num_envs=N, mode="asynchronous", control_period_s=PERIOD_S, max_action_age_s=5.0
     )
-    policy = graph.start("policy", policy_factory="toy:make_slow_policy", mode="asynchronous")
-    wait_until("both nodes", lambda: estop.get_subscription_count() >= 2, 60)
+    policy = graph.start("policy", policy__factory="toy:make_slow_policy", mode="asynchronous")
+    wait_until("both nodes", lambda: estop.get_subscription_count() >= 2)
     for _ in range(3):
         seen = len(actions)
-        wait_until("actions", lambda: len(actions) > seen + 2 and not held(transitions[-1]), 60)  # noqa: B023
+        wait_until("actions", lambda: len(actions) > seen + 2 and not held(transitions[-1]))  # noqa: B023
         count = len(transitions)
         wait_until("the next observation", lambda: len(transitions) > count)  # noqa: B023
         time.sleep(toy.SLOW_S / 2)  # into the inference
         estop.publish(Bool(data=True))
         stopped_s = time.monotonic()
-        wait_until("the hold", lambda: actions[-1].mode == ActionBatch.MODE_HOLD, PERIOD_S)
+        wait_until("the hold", lambda: actions[-1].mode == ActionBatch.MODE_HOLD)
         time.sleep(PERIOD_S)
         count, made = len(actions), len(transitions)
         for node in ("/wm/environment", "/wm/policy"):
@@ -157,8 +157,8 @@ def test_no_action_is_published_or_executed_after_an_emergency_stop_until_it_is_
     assert policy.wait(20) == 0
     del probe.diagnostics["/wm/policy"]
     count = len(actions)
-    graph.start("policy", policy_factory="toy:make_slow_policy", mode="asynchronous")
-    wait_until("the new policy", lambda: "/wm/policy" in probe.diagnostics, 60)
+    graph.start("policy", policy__factory="toy:make_slow_policy", mode="asynchronous")
+    wait_until("the new policy", lambda: "/wm/policy" in probe.diagnostics)
     wait_until("the stop in it", lambda: "emergency stop" in probe.diagnostics["/wm/policy"].message)
     send = probe.publisher("action")
     wait_until("matching", send.get_subscription_count)
@@ -169,18 +169,18 @@ def test_no_action_is_published_or_executed_after_an_emergency_stop_until_it_is_
     wait_until("the refusal", lambda: value(probe, "refused_action"))
     assert all(m.mode == ActionBatch.MODE_HOLD for m in actions[count:] if m.session) and len(transitions) == made
     estop.publish(Bool(data=False))
-    wait_until("actions of the new policy", lambda: len(actions) > count + 3, 60)
+    wait_until("actions of the new policy", lambda: len(actions) > count + 3)
 
 
 def test_a_rollout_ends_with_the_emergency_stop_as_its_reason(graph: Graph, probe: Probe) -> None:
     transitions, estop = probe.listen("env/transition"), probe.publisher("safety/estop")
     graph.start_environment("toy:make_long_environment", num_envs=N)
     graph.start_policy()
-    wait_until("both nodes", lambda: estop.get_subscription_count() >= 2, 60)
+    wait_until("both nodes", lambda: estop.get_subscription_count() >= 2)
     handle = probe.send(probe.action(Rollout, "rollout"), Rollout.Goal(steps=100_000, reset=True))
     wait_until("steps", lambda: len(transitions) > 5)
     estop.publish(Bool(data=True))
-    result = probe.finish(handle, 10)
+    result = probe.finish(handle)
     assert result.termination_reason == Rollout.Result.FAILED
     assert "the emergency stop is set; publish false on safety/estop to go on" in result.message
     wait_until("the condition", lambda: "emergency stop is set" in probe.diagnostics["/wm/policy"].message)

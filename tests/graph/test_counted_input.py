@@ -66,13 +66,12 @@ def test_a_bad_message_is_counted_by_every_reader_and_training_goes_on(graph: Gr
     running = probe.send(probe.action(Train, "train"), Train.Goal(updates=100000), updates.append)
     for name, make, nodes, counter, texts in BAD_MESSAGES:
         publisher, message = probe.publisher(name), make(client.spec, client.session)
-        wait_until("matching", lambda: publisher.get_subscription_count() >= len(nodes), 30)  # noqa: B023
+        wait_until("matching", lambda: publisher.get_subscription_count() >= len(nodes))  # noqa: B023
         for node in nodes:
             wait_for_count(probe, node, counter, texts, lambda: publisher.publish(message))  # noqa: B023
         count = len(updates)
-        wait_until("another update", lambda: len(updates) > count, 30)  # noqa: B023
-    probe.run(running.cancel_goal_async, 5, "cancel")
-    assert probe.finish(running).termination_reason == Train.Result.CANCELED
+        wait_until("another update", lambda: len(updates) > count)  # noqa: B023
+    assert probe.cancel(running).termination_reason == Train.Result.CANCELED
     assert train(probe, updates=1).termination_reason == Train.Result.FINISHED
 
 
@@ -138,7 +137,7 @@ def test_a_version_of_another_architecture_is_refused_and_the_old_weights_go_on_
 ) -> None:
     graph.start_policy()
     publisher = probe.publisher("policy/version")
-    wait_until("the policy", lambda: probe.value(POLICY, "state") == "active", 30)
+    wait_until("the policy", lambda: probe.value(POLICY, "state") == "active")
     wait_until("matching", publisher.get_subscription_count)
     publisher.publish(PolicyVersion(version=7, sha256="0" * 64, arch_hash="ab" * 32))
     wait_until("the count", lambda: probe.value(POLICY, "refused_versions") == "1")

@@ -10,9 +10,10 @@ from std_msgs.msg import Bool
 
 from wm_msgs.msg import EpisodeEvent, ErrorCode
 from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.ros import calls, convert
-from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand, WireError
+from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand
 
 pytestmark = pytest.mark.graph
 N = 4
@@ -37,11 +38,11 @@ class Client:
 
     def step(self, command: StepCommand) -> Reply:
         response = self.probe.call(StepBatch, "env/step", calls.step_request(command))
-        return calls.step_reply(response, self.spec, self.session)
+        return calls.reply_of(response, self.spec, self.session)
 
     def reset(self, **arguments: Any) -> Reply:
         request = calls.reset_request(ResetCommand(**arguments))
-        return calls.reset_reply(self.probe.call(ResetBatch, "env/reset", request), self.spec)
+        return calls.reply_of(self.probe.call(ResetBatch, "env/reset", request), self.spec)
 
 
 @pytest.fixture

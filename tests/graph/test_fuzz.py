@@ -35,7 +35,7 @@ def make_storm(probe: Probe) -> Iterator[Callable[..., Storm]]:
 
     def make(*names: str) -> Storm:
         for name in names:
-            wait_until(f"active {name}", lambda n=name: probe.value(n, "state") == "active", 60)
+            wait_until(f"active {name}", lambda n=name: probe.value(n, "state") == "active")
         made.append(Storm(probe, list(names), MessageGenerator(SEED)))
         return made[0]
 
@@ -51,7 +51,7 @@ def test_loop_1_in_lock_step_counts_every_message_and_trains_the_same_weights(
     graph.start("recorder", min_free_mib=16)
     graph.start_training_nodes()
     graph.start_environment(namespace="/wm/sim")
-    graph.start("evaluation", policy_factory="toy:make_policy")
+    graph.start("evaluation", policy__factory="toy:make_policy")
     graph.start("player")
     storm = make_storm(*graph.processes)
     client = Client(probe)

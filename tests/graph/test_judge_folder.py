@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from clip_folders import write_clips
+from deadlines import within
 from graph.harness import Graph, Probe, own_domain, wait_until
 from judge_server import PickyServer
 from safetensors.numpy import load_file
@@ -38,7 +39,7 @@ class Evaluator:
         self._graph = Graph(domain, folder, load_config("smoke", judge))
         self.verdicts: list[ClipVerdict] = self.probe.listen("reward/verdict")
         self._graph.start("reward_evaluator", reward="agent", audit_dir="audit", allowed_dirs=[str(allowed)])
-        wait_until("the evaluator", lambda: self.probe.value(NODE, "state") == "active", 60)
+        wait_until("the evaluator", lambda: self.probe.value(NODE, "state") == "active")
         self._client = self.probe.action(JudgeClips, "reward/judge_clips")
 
     def close(self) -> None:
@@ -223,7 +224,7 @@ def test_a_cancel_is_answered_at_once_and_the_rubric_stays_while_clips_are_judge
     began = time.monotonic()
     handle.cancel_goal_async()
     result = evaluator.probe.finish(handle)
-    assert result.termination_reason == JudgeClips.Result.CANCELED and time.monotonic() - began < ANSWER_S
+    assert result.termination_reason == JudgeClips.Result.CANCELED and time.monotonic() - began < within(ANSWER_S)
     server.delay_s = 0.0
     assert evaluator.judge(folder=str(tmp_path)).termination_reason == JudgeClips.Result.FINISHED
 

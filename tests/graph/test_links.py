@@ -22,7 +22,7 @@ def test_a_recorder_that_starts_last_has_every_message_of_the_first_rollout(grap
     graph.start_environment()
     graph.start_policy(await_nodes=["environment", "recorder"])
     client = probe.action(Rollout, "rollout")
-    wait_until("the policy", lambda: probe.value("/wm/policy", "state") == "active", 60)
+    wait_until("the policy", lambda: probe.value("/wm/policy", "state") == "active")
     handle = probe.send(client, Rollout.Goal(steps=STEPS, reset=True, seed=1))
     graph.start("recorder")
     assert probe.finish(handle, 60).termination_reason == Rollout.Result.FINISHED
@@ -41,7 +41,7 @@ def test_what_concerns_one_observation_has_its_wall_time_on_every_topic(graph: G
     graph.start_reward()
     began_ns = time.time_ns()
     client = probe.action(Rollout, "rollout")
-    wait_until("the policy", lambda: probe.value("/wm/policy", "state") == "active", 60)
+    wait_until("the policy", lambda: probe.value("/wm/policy", "state") == "active")
     result = probe.finish(probe.send(client, Rollout.Goal(steps=STEPS, reset=True, seed=1)), 60)
     assert result.termination_reason == Rollout.Result.FINISHED
     wait_until("the last reward", lambda: int(probe.value("/wm/recorder", "messages") or 0) >= 4 * STEPS)
@@ -76,7 +76,7 @@ def test_a_rollout_without_an_awaited_node_goes_on_after_the_deadline_and_says_s
     graph.start_environment()
     graph.start_policy(await_nodes=["environment", "recorder"], match_timeout_s=1.0)
     client = probe.action(Rollout, "rollout")
-    wait_until("the policy", lambda: probe.value("/wm/policy", "state") == "active", 60)
+    wait_until("the policy", lambda: probe.value("/wm/policy", "state") == "active")
     result = probe.finish(probe.send(client, Rollout.Goal(steps=3, reset=True)))
     assert result.termination_reason == Rollout.Result.FINISHED
     wait_until("the count", lambda: int(probe.value("/wm/policy", "unmatched_nodes") or 0) >= 1)

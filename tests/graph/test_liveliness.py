@@ -19,13 +19,13 @@ def test_a_stopped_environment_is_one_warning_and_one_recovery_for_each_node(gra
     graph.start_training_nodes()
     updates: list[Any] = []
     running = probe.send(probe.action(Train, "train"), Train.Goal(updates=100000), updates.append)
-    wait_until("an update", lambda: updates, 60)
+    wait_until("an update", lambda: updates)
     environment = graph.processes["/wm/environment"]
     environment.send_signal(signal.SIGSTOP)
     time.sleep(STOPPED_S)
     environment.send_signal(signal.SIGCONT)
     count = len(updates)
-    wait_until("training that goes on", lambda: len(updates) > count, 60)
+    wait_until("training that goes on", lambda: len(updates) > count)
     for node in ("/wm/learner", "/wm/policy", "/wm/reward_evaluator"):
         told = [line for line in graph.log(node).splitlines() if re.search("ERROR|WARN|is back", line)]
         about = [line for line in told if "/wm/environment" in line and "rollout" not in line]
@@ -45,7 +45,7 @@ def test_an_environment_that_computes_for_twice_the_timeout_is_not_reported(grap
     updates: list[Any] = []
     running = probe.send(probe.action(Train, "train"), Train.Goal(updates=100000), updates.append)
     began = time.monotonic()
-    wait_until("an update after it", lambda: updates and time.monotonic() - began > COMPUTING_S, 60)
+    wait_until("an update after it", lambda: updates and time.monotonic() - began > COMPUTING_S)
     for node in ("/wm/learner", "/wm/policy", "/wm/reward_evaluator"):
         assert "lost" not in graph.log(node) and "silent" not in graph.log(node)
     del running

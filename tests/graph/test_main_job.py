@@ -2,13 +2,11 @@
 
 import hashlib
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from graph.launched import train_policy
 from judge_server import PickyServer, serving
 from model_folders import make_model_folder
 from safetensors.numpy import save_file
@@ -23,14 +21,10 @@ from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.starts import INSTRUCTIONS
 
 pytestmark = pytest.mark.graph
-PROGRAM = "import sys; from wm_nodes.apps.cli import main; sys.exit(main(['train-policy', *sys.argv[1:]]))"
+SMALL = ["--preset", "smoke", *(f"--set={name}" for name in (
+    "acceptance.num_episodes=2", "acceptance.clone_episodes=2", "data.num_workers=1", "simulation.max_episode_steps=12"
+))]
 RATES = ("real_before", "real_after", "imagined_before", "imagined_after")
-
-
-def start(arguments: list[str], domain: int) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "COLUMNS": "160"}
-    command = [sys.executable, "-c", PROGRAM, "--domain-id", str(domain), *arguments]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
 
 
 @pytest.mark.slow
@@ -38,15 +32,15 @@ def test_the_main_job_stops_at_acceptance_and_when_forced_leaves_summary_report_
     ros_domain: int, tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"
-    arguments = ["--preset", "smoke", "--set", "acceptance.tool_error_ratio=0.001", "--run-dir", str(run_dir),
+    arguments = [*SMALL, "--set", "acceptance.tool_error_ratio=0.001", "--run-dir", str(run_dir),
                  "--set", "exploit_meter.every=2", "--set", "exploit_meter.episodes=3"]
-    refused = start(arguments, ros_domain)
+    refused = train_policy(arguments, ros_domain)
     assert refused.returncode == 3, refused.stdout + refused.stderr
     said = refused.stderr
     assert "tool error / copying" in said and "or go on with --force" in said
     policies = sorted(path.name for path in (run_dir / "policies").iterdir())
     assert policies == ["policy_000001.safetensors", "weak.safetensors"], "trained in a model that failed"
-    done = start(["--run-dir", str(run_dir), "--force"], ros_domain)
+    done = train_policy(["--run-dir", str(run_dir), "--force"], ros_domain)
     assert done.returncode == 0, done.stdout + done.stderr
     summary = read_summary(run_dir)
     assert (summary["task"], summary["preset"], summary["seed"]) == ("push_cube", "smoke", 0)
@@ -80,9 +74,9 @@ def test_two_online_rounds_refresh_the_model_and_a_resumed_run_repeats_only_what
     run_dir = tmp_path / "run"
     model = make_model_folder(tmp_path / "model")
     write_some_starts(run_dir / "starts.safetensors")
-    arguments = ["--preset", "smoke", "--force", "--rounds", "2", "--model-dir", str(model), "--run-dir", str(run_dir),
-                 "--set", "evaluation.episodes=2", "--set", "data.num_workers=1", "--compose"]
-    done = start(arguments, ros_domain)
+    arguments = [*SMALL, "--force", "--rounds", "2", "--model-dir", str(model), "--run-dir", str(run_dir),
+                 "--set", "evaluation.episodes=2", "--compose"]
+    done = train_policy(arguments, ros_domain)
     assert done.returncode == 0, done.stdout + done.stderr
     assert {path.name for path in run_dir.iterdir()} <= RUN_ENTRIES, "a peer may write what is not listed there"
     first, last = read_summary(run_dir)["rounds"]
@@ -98,7 +92,7 @@ def test_two_online_rounds_refresh_the_model_and_a_resumed_run_repeats_only_what
     for lost in ("trained.json", "evaluations/real_before.json"):  # as if stopped after the last update of round 1
         (run_dir / "rounds" / "1" / lost).unlink()
     finished = {path: path.stat().st_mtime_ns for path in (run_dir / "rounds" / "2").rglob("*") if path.is_file()}
-    done = start(["--run-dir", str(run_dir)], ros_domain)
+    done = train_policy(["--run-dir", str(run_dir)], ros_domain)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "training the policy in the world model: 0 updates" in done.stdout
     assert done.stdout.count("starting the graph") == 1
@@ -110,15 +104,17 @@ def test_two_online_rounds_refresh_the_model_and_a_resumed_run_repeats_only_what
 
 
 @pytest.mark.slow
-def test_the_agent_pays_the_policy_and_the_run_goes_on_with_that_reward_only(ros_domain: int, tmp_path: Path) -> None:
+def test_the_agent_pays_the_policy_and_the_run_goes_on_with_that_reward_only(
+    ros_domain: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     run_dir = tmp_path / "run"
     write_some_starts(run_dir / "starts.safetensors")
-    arguments = ["--preset", "smoke", "--force", "--model-dir", str(make_model_folder(tmp_path / "model")),
-                 "--run-dir", str(run_dir), "--set", "evaluation.episodes=2", "--set", "data.num_workers=1",
-                 "--set", "ppo.num_steps=16", "--set", "ppo.num_envs=3", "--compose"]
+    arguments = [*SMALL, "--force", "--model-dir", str(make_model_folder(tmp_path / "model")),
+                 "--run-dir", str(run_dir), "--set", "evaluation.episodes=2",
+                 "--set", "ppo.num_steps=12", "--set", "ppo.num_envs=3", "--compose"]
     with serving(PickyServer()) as server:
         agent = ["--reward", "agent", "--judge", server.url, "--judge-model", "judge"]
-        done = start([*arguments, *agent], ros_domain)
+        done = train_policy([*arguments, *agent], ros_domain)
         assert done.returncode == 0, done.stdout + done.stderr
         asked = len(server.requests)
         assert asked
@@ -129,20 +125,20 @@ def test_the_agent_pays_the_policy_and_the_run_goes_on_with_that_reward_only(ros
         with Bag(Path(summary["bag"])) as bag:
             assert bag.count("/wm/reward/verdict")
         assert recorded_reward_name(Path(summary["bag"])) == "agent"
-        other = start([*arguments, "--reward", "endogenous"], ros_domain)
-        assert other.returncode == 2 and other.stderr.count("\n") == 1
-        assert "--reward is 'agent' in this run, 'endogenous' is given" in other.stderr
+        capfd.readouterr()
+        assert main(["train-policy", *arguments, "--reward", "endogenous"]) == 2
+        error = capfd.readouterr().err
+        assert "--reward is 'agent' in this run, 'endogenous' is given" in error and error.count("\n") == 1
         for options in ([*arguments, *agent], ["--run-dir", str(run_dir)]):
-            again = start(options, ros_domain)
-            assert again.returncode == 0 and "training is done already" in again.stdout, again.stdout + again.stderr
+            assert main(["train-policy", *options]) == 0
+            assert "training is done already" in capfd.readouterr().out
         assert len(server.requests) == asked
 
 
-def test_a_wrong_setting_ends_with_one_clear_line(ros_domain: int, tmp_path: Path) -> None:
-    done = start(["--set", "ppo.updates=many", "--run-dir", str(tmp_path)], ros_domain)
-    assert done.returncode == 2
-    assert "ppo.updates" in done.stderr and "many" in done.stderr and "Traceback" not in done.stdout + done.stderr
+def test_a_wrong_setting_ends_with_one_clear_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["train-policy", "--set", "ppo.updates=many", "--run-dir", str(tmp_path)]) == 2
+    error = capfd.readouterr().err
+    assert "ppo.updates" in error and "many" in error and "Traceback" not in error
     meter = ["--set", "exploit_meter.every=1", "--set", "evaluation.episodes=3"]
-    done = start([*meter, "--run-dir", str(tmp_path)], ros_domain)
-    assert done.returncode == 2
-    assert "exploit_meter.episodes is 32, and this run has 24 first frames" in done.stderr, done.stderr
+    assert main(["train-policy", *meter, "--run-dir", str(tmp_path)]) == 2
+    assert "exploit_meter.episodes is 32, and this run has 24 first frames" in capfd.readouterr().err

@@ -33,8 +33,8 @@ def start_all(graph: Graph, probe: Probe) -> None:
     graph.start_learner()
     graph.start("recorder", record_at_start=False, min_free_mib=16)
     graph.start("player", play_at_start=False)
-    graph.start("evaluation", policy_factory="toy:make_policy")
-    wait_until("the nodes", lambda: all(probe.value(node, "state") == "active" for node in NODES), 60)
+    graph.start("evaluation", policy__factory="toy:make_policy")
+    wait_until("the nodes", lambda: all(probe.value(node, "state") == "active" for node in NODES))
 
 
 def by_service(probe: Probe, kind: type[Any], name: str, field: str) -> Callable[[str], tuple[int, str]]:

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import rclpy
+from deadlines import within
 from diagnostic_msgs.msg import DiagnosticArray
 from graph.harness import MATCH_S
 from rclpy.action import ActionClient
@@ -379,7 +380,7 @@ def test_the_player_pauses_steps_seeks_and_is_cancelled(domain: int, tmp_path: P
     player.wait(cancelled.done, "cancel answer")
     player.wait(done.done, "cancelled result")
     assert done.result().result.termination_reason == Replay.Result.CANCELED
-    assert time.monotonic() - began < 1
+    assert time.monotonic() - began < within(1.0)
 
 
 def test_a_bag_that_cannot_be_played_is_a_failed_goal_with_the_reason(domain: int, tmp_path: Path, peer: Start) -> None:

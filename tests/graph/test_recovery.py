@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import yaml
+from deadlines import within
 from graph import toy
 from graph.harness import Graph, Probe, wait_until
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
@@ -35,7 +36,7 @@ def start_recorder(graph: Graph) -> Any:
 
 
 def active(probe: Probe, *names: str) -> None:
-    wait_until(f"active {names}", lambda: all(probe.value(name, "state") == "active" for name in names), 60)
+    wait_until(f"active {names}", lambda: all(probe.value(name, "state") == "active" for name in names))
 
 
 def slow_replay() -> SetParameters.Request:
@@ -48,10 +49,6 @@ def evaluate(probe: Probe, episodes: int, timeout_s: float = 60.0) -> Any:
     return probe.finish(probe.send(probe.action(Evaluate, "evaluate"), goal), timeout_s)
 
 
-def _reported(probe: Probe, reporter: str, lost: str) -> bool:
-    return any(f"{lost} is lost" in text for text in probe.seen_errors[reporter])
-
-
 @pytest.mark.kills
 def test_a_killed_recorder_records_again_beside_what_it_left(graph: Graph, probe: Probe) -> None:
     book = probe.links()
@@ -61,7 +58,7 @@ def test_a_killed_recorder_records_again_beside_what_it_left(graph: Graph, probe
     assert probe.finish(probe.send(client, Train.Goal(updates=1))).termination_reason == Train.Result.FINISHED
     time.sleep(2.0)  # a kill may cost the recorder's last second
     graph.kill("/wm/recorder")
-    wait_until("the report", lambda: _reported(probe, "/wm/learner", "/wm/recorder"), 5.0)
+    probe.wait_for_loss("/wm/learner", "/wm/recorder")
     probe.diagnostics.pop("/wm/recorder", None)
     graph.restart(lambda: start_recorder(graph), book, "/wm/recorder", "/wm/learner", "/wm/policy", "/wm/environment")
     active(probe, "/wm/recorder")
@@ -80,7 +77,7 @@ def test_evaluation_episodes_are_recorded_and_a_killed_simulator_or_evaluation_n
     start_recorder(graph)
     nodes: dict[str, Any] = {
         "/wm/sim/environment": lambda: graph.start_environment(namespace="/wm/sim", num_envs=3),
-        "/wm/evaluation": lambda: graph.start("evaluation", policy_factory="toy:make_policy"),
+        "/wm/evaluation": lambda: graph.start("evaluation", policy__factory="toy:make_policy"),
     }
     for start in nodes.values():
         start()
@@ -95,13 +92,13 @@ def test_evaluation_episodes_are_recorded_and_a_killed_simulator_or_evaluation_n
         wait_until("its steps", lambda c=count: len(steps) > c + 5)
         graph.kill(name)
         if name == "/wm/sim/environment":
-            wait_until("the report", lambda: _reported(probe, "/wm/evaluation", "/wm/sim/environment"), 5.0)
-            lost = probe.finish(running, 8.0)  # before its step_timeout_s: it hears /wm/sim's heartbeats
+            probe.wait_for_loss("/wm/evaluation", "/wm/sim/environment")
+            lost = probe.finish(running, within(8.0))  # before its step_timeout_s: it hears /wm/sim's heartbeats
             assert lost.termination_reason == Evaluate.Result.PEER_LOST and "environment" in lost.message
             lost = evaluate(probe, 1)
             assert lost.termination_reason == Evaluate.Result.PEER_LOST and "environment" in lost.message
         else:
-            wait_until("the report", lambda: _reported(probe, "/wm/recorder", "/wm/evaluation"), 5.0)
+            probe.wait_for_loss("/wm/recorder", "/wm/evaluation")
         probe.diagnostics.pop(name, None)
         start()
         active(probe, name)
@@ -127,7 +124,7 @@ def test_a_killed_player_plays_again(graph: Graph, probe: Probe) -> None:
     time.sleep(1.0)  # two heartbeats
     probe.send(client, Replay.Goal(bag_uri="bag", rate=0.01))
     graph.kill("/wm/player")
-    wait_until("the report", lambda: _reported(probe, "/wm/environment", "/wm/player"), 5.0)
+    probe.wait_for_loss("/wm/environment", "/wm/player")
     graph.start("player")
     probe.diagnostics.pop("/wm/player", None)
     active(probe, "/wm/player")
@@ -149,7 +146,7 @@ def test_a_training_from_a_player_that_is_killed_ends_with_its_name(graph: Graph
     handle = probe.send(probe.action(Train, "train"), graph_goal)
     time.sleep(2.0)
     graph.kill("/wm/player")
-    result = probe.finish(handle, 15.0)
+    result = probe.finish(handle, within(15.0))
     assert result.termination_reason == Train.Result.PEER_LOST and "/wm/player is silent" in result.message
 
 
@@ -162,22 +159,22 @@ def test_a_client_of_a_killed_learner_gets_an_error(
     updates = list[Any]()
     with GraphClient() as client, ThreadPoolExecutor(1) as pool:
         training = pool.submit(client.train, 100000, updates.append)
-        wait_until("an update", lambda: updates, 60)
+        wait_until("an update", lambda: updates)
         graph.kill("/wm/learner")
         with pytest.raises(PeerLost, match=r"/wm/learner (is silent|was stopped or restarted)"):
-            training.result(15.0)
+            training.result(within(15.0))
 
 
-@pytest.mark.parametrize("learner", [{}, {"learner_factory": "toy:make_stuck_learner"}])
+@pytest.mark.parametrize("learner", [{}, {"learner__factory": "toy:make_stuck_learner"}])
 def test_a_learner_that_is_told_to_end_answers_its_goals_client_also_where_it_is_stuck(
     graph: Graph, probe: Probe, learner: dict[str, str]
 ) -> None:
     graph.start_training_nodes(**learner)
     updates = list[Any]()
     handle = probe.send(probe.action(Train, "train"), Train.Goal(updates=100000), updates.append)
-    wait_until("work", lambda: updates or "stuck" in graph.log("/wm/learner"), 60)
+    wait_until("work", lambda: updates or "stuck" in graph.log("/wm/learner"))
     graph.processes["/wm/learner"].terminate()
-    result = probe.finish(handle, 6.0)
+    result = probe.finish(handle, within(6.0))
     assert (result.termination_reason, result.message) == (Train.Result.DEACTIVATED, "shut down")
 
 

@@ -20,10 +20,10 @@ pytestmark = pytest.mark.graph
 
 def start_learner(graph: Graph, namespace: str = "/wm") -> int:
     """Start a learner, and return its process once the folder is its own, or its exit code."""
-    process = graph.start("learner", namespace, policy_factory="toy:make_policy")
+    process = graph.start("learner", namespace, policy__factory="toy:make_policy")
     lock = graph.folder / NAME
     wait_until("lock", lambda: process.poll() is not None or (lock.exists() and f'"process": {process.pid},' in
-                                                             lock.read_text()), 60)
+                                                             lock.read_text()))
     return process.pid if process.poll() is None else process.wait(0)
 
 

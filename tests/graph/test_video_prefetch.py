@@ -51,7 +51,7 @@ def test_prefetching_gives_the_weights_of_the_delayed_loop_and_counts_its_stalen
 def test_cancel_leaves_no_goal_under_way(loop: VideoLoop) -> None:
     fed = list[Any]()
     handle = loop.send(100000, fed.append)
-    wait_until("a trained buffer", lambda: fed, 30)
+    wait_until("a trained buffer", lambda: fed)
     assert loop.cancel(handle).termination_reason == TrainVideo.Result.CANCELED
     time.sleep(0.5)
     client = loop.probe.action(GenerateClips, "video/generate")
@@ -65,7 +65,7 @@ def test_cancel_leaves_no_goal_under_way(loop: VideoLoop) -> None:
 def test_a_killed_learner_and_video_model_go_on_with_the_version_before(loop: VideoLoop) -> None:
     fed = list[Any]()
     loop.send(100000, fed.append)
-    wait_until("two trained buffers, so that the version before is not the model's own folder", lambda: fed[1:], 30)
+    wait_until("two trained buffers, so that the version before is not the model's own folder", lambda: fed[1:])
     for node in ("video_learner", "video_model"):
         loop.graph.kill(f"/wm/{node}")
     for node in ("video_learner", "video_model"):  # who comes later knows only what is latched

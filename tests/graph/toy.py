@@ -16,7 +16,7 @@ from wm_nodes.core.cameras import CameraModel, Matrix, intrinsics, look_at
 from wm_nodes.core.specs import SOURCE_SIMULATOR, EnvironmentSpec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
-from wm_nodes.nodes.factories import make_learner
+from wm_nodes.policy_rl.factories import make_learner
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
 from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.reward import RuleReward

@@ -23,8 +23,8 @@ from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.reference_reward import load_probe
-from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts, rollout_settings
-from wm_nodes.video_rl.train import post_train
+from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
+from wm_nodes.video_rl.train import post_train, sample_buffers
 from wm_nodes.video_rl.training_run import VIDEO_FILES
 
 EPISODES, STEPS, STRIDE = 4, 4, 2
@@ -88,8 +88,8 @@ class LocalLoop:
             load_video_folder(folder), load_clips([bag], STRIDE), config, load_probe(MODEL_DIR)
         )
         self._network = load_video_folder(folder).network
-        self._learner = GrpoLearner(self._network, config.grpo, rollout_settings(config.rollout), seed=config.seed)
-        self._training = post_train(self._learner, self, ITERATIONS)
+        self._learner = GrpoLearner(self._network, config.grpo, config.rollout, seed=config.seed)
+        self._training = post_train(self._learner, sample_buffers(self, self._learner, ITERATIONS))
         self._files = [self._packed()]
         self.versions = [0]
         """Before each iteration that was made, and now."""
@@ -156,7 +156,7 @@ class VideoLoop:
     def wait_active(self, *nodes: str) -> None:
         """Wait until the nodes are active, and none of them is lost to the learner any more."""
         for node in nodes or NAMES:
-            wait_until(f"active {node}", lambda n=node: self.probe.value(NAMES[n], "state") == "active", 60)
+            wait_until(f"active {node}", lambda n=node: self.probe.value(NAMES[n], "state") == "active")
             wait_until(f"a learner that hears {node}", lambda n=node: not self._lost(NAMES[n]))
 
     def _lost(self, name: str) -> bool:
@@ -183,8 +183,7 @@ class VideoLoop:
         return self.probe.send(client, TrainVideo.Goal(iterations=iterations, **goal), feedback)
 
     def cancel(self, handle: Any) -> TrainVideo.Result:
-        self.probe.run(handle.cancel_goal_async, 5, "cancel")
-        return self.probe.finish(handle, 5)
+        return self.probe.cancel(handle)
 
     def newest(self, result: TrainVideo.Result) -> bytes:
         """The weights file of a result's version."""

@@ -10,6 +10,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
+from benchmarks.experiment import EXPERIMENTS
 from wm_nodes.apps import cli
 from wm_nodes.core.errors import ModelNotAcceptedError, RunError
 
@@ -34,10 +35,7 @@ OPTIONS = {
     "judge hack": "clips --config --device --judge --judge-model --judge-key-env --rubric --least --limit "
     "--limit-clips --seed --reads --json --pictures",
     "audit": "verify recover sample view agree people replay",
-    "benchmark speed": "--json --quick --preset --model-dir --untrained --seed",
-    "benchmark environments": "trained-in ranking speed",
-    "benchmark video-rl": "base diversity learning ablations hacking cost clips clip-learning resolution",
-    "benchmark judge": "erring success-clips",
+    **{f"benchmark {name}": "--json" for name in EXPERIMENTS},
 }
 
 
@@ -58,7 +56,7 @@ def test_every_verb_is_listed_with_what_it_does(capsys: pytest.CaptureFixture[st
     for words in (["benchmark"], ["benchmark", "--help"]):
         assert cli.main(words) == 0
         listed = capsys.readouterr().out
-        assert "benchmark video-rl" in listed and "train-policy" not in listed
+        assert "benchmark diversity" in listed and "train-policy" not in listed
 
 
 @pytest.mark.parametrize("verb", OPTIONS)
@@ -69,18 +67,12 @@ def test_every_verb_explains_itself_and_names_its_options(verb: str, capsys: pyt
         assert re.search(rf"(^|[\s,{{|\[]){re.escape(option)}($|[\s,}}|\]])", text), f"{option} is not in\n{text}"
 
 
-@pytest.mark.parametrize("suite", ["environments", "video-rl", "judge"])
-def test_every_experiment_explains_itself(suite: str, capsys: pytest.CaptureFixture[str]) -> None:
-    for name in OPTIONS[f"benchmark {suite}"].split():
-        assert f"usage: wm benchmark {suite} {name}" in shown(["benchmark", suite, name], capsys)
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["train-polcy"], "unknown verb 'train-polcy'; did you mean 'train-policy'? wm --help lists the verbs"),
         (["doctor"], "unknown verb 'doctor'; wm --help lists the verbs"),
-        (["benchmark", "vido-rl"], "unknown verb 'benchmark vido-rl'; did you mean 'benchmark video-rl'?"),
+        (["benchmark", "hackin"], "unknown verb 'benchmark hackin'; did you mean 'benchmark hacking'?"),
         (["recover-bag", "nothing-here"], "no .mcap file at nothing-here"),
         (["rescore", "nothing-here"], "nothing-here holds no config.yaml; name the run folder"),
         (["train-policy", "--set", "ppo.updates=many"], "ppo.updates"),
@@ -159,7 +151,7 @@ def test_without_the_repository_a_benchmark_says_where_it_is(
 
 def test_the_list_of_verbs_is_there_at_once_and_the_scripts_start_the_command(repository: Path) -> None:
     loaded = "import sys; from wm_nodes.apps.cli import main; main(['--help']); print('torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True)
     assert done.stdout.endswith("False\n"), "wm --help imports torch"
     for name in ("wm", "online_rl"):
         assert "wm_nodes.apps.cli import" in (repository / "launch_scripts" / f"{name}.py").read_text()

@@ -9,9 +9,8 @@ import pytest
 
 from wm_nodes.apps.cli import main
 from wm_nodes.config.scenes import SCENES
-from wm_nodes.environments import record
-from wm_nodes.environments.maniskill import collection
-from wm_nodes.environments.maniskill.collection import behaviour_of
+from wm_nodes.environments import collection, record
+from wm_nodes.environments.collection import behaviour_of
 from wm_nodes.environments.record import success_table
 from wm_nodes.recording import read_episodes
 

@@ -28,7 +28,7 @@ def test_the_pages_are_those_of_the_parsers(monkeypatch: pytest.MonkeyPatch) -> 
         ("wm.py benchmark -h", "usage: python3 launch_scripts/wm.py VERB [options]"),
         ("wm.py train-policy --seed 1 --help", "usage: python3 launch_scripts/wm.py train-policy [-h] [--preset"),
         ("wm.py audit verify log --help", "usage: python3 launch_scripts/wm.py audit verify [-h]"),
-        ("wm.py benchmark video-rl clips -h", "usage: python3 launch_scripts/wm.py benchmark video-rl clips [-h]"),
+        ("wm.py benchmark clips -h", "usage: python3 launch_scripts/wm.py benchmark clips [-h]"),
         ("online_rl.py --help", "usage: python3 launch_scripts/online_rl.py [-h] [--preset"),
         ("run_tests.py --help", "Every check of the repository"),
         ("setup --help", "usage: setup [-h] [--check]"),

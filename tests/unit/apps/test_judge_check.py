@@ -12,6 +12,7 @@ from tiny_vlm import save_tiny_vlm, transformers_serve
 from wm_nodes.apps.cli import main
 
 
+@pytest.mark.slow
 def test_a_server_that_pays_everything_is_good_for_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with serving(ChatServer(level=4)) as server:
         command = ["judge", "check", server.url, "--model", "judge", "--limit", "8", "--reads", str(tmp_path / "reads")]

@@ -12,6 +12,7 @@ from wm_nodes.judge.hacking.attack import PER_CLIP
 from wm_nodes.judge.hacking.edits import PATTERNS
 
 
+@pytest.mark.slow
 def test_a_server_that_pays_everything_fails_is_drawn_and_is_not_asked_twice(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -45,6 +46,7 @@ def test_clips_that_are_not_paid_are_not_attacked_and_one_error_says_so(
     assert 'one line per clip, e.g. {"file": "a.mp4"' in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.rendering
 def test_the_shipped_judge_holds_on_the_episodes_of_a_bag(tmp_path: Path) -> None:
     recorded = ["collect", str(tmp_path), "--tasks", "push_cube", "--episodes", "2", "--first-seed", "910000"]

@@ -33,7 +33,7 @@ from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder, save_video_folder
 from wm_nodes.video_model.success_reader import SuccessReader, load_success_reader, save_success_reader
 from wm_nodes.video_model.tokenizer_codec import codec_of_world_model
-from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts, rollout_settings
+from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
 from wm_nodes.world_model.position_probe import PositionProbe
 
 STEPS, EPISODES = 12, 3
@@ -100,7 +100,7 @@ def test_flow_matching_towards_what_is_kept_brings_the_model_nearer_to_it_and_eq
         network = VideoNetwork(folder.network.settings)
         network.load_state_dict(start)
         learners.append(FlowMatchingLearner(
-            network, settings, rollout_settings(CONFIG.rollout), seed=0, keep=keep, draws=4  # type: ignore[arg-type]
+            network, settings, CONFIG.rollout, seed=0, keep=keep, draws=4  # type: ignore[arg-type]
         ))
         losses = [-update.objective for _ in range(20) for update in learners[-1].train(buffer).updates]
         assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:5])
@@ -114,7 +114,7 @@ def test_flow_matching_towards_what_is_kept_brings_the_model_nearer_to_it_and_eq
 def test_draws_are_spread_evenly(folder: VideoFolder) -> None:
     settings = CONFIG.grpo.with_values(updates_per_buffer=3)
     with pytest.raises(ValueError, match="4 draws cannot be spread over 3 updates"):
-        FlowMatchingLearner(tiny_network(), settings, rollout_settings(CONFIG.rollout), seed=0, keep="all", draws=4)
+        FlowMatchingLearner(tiny_network(), settings, CONFIG.rollout, seed=0, keep="all", draws=4)
 
 
 def arm_config(sampler: SamplerSetup) -> VideoRlConfig:
@@ -142,8 +142,8 @@ def test_the_command_trains_every_arm_and_goes_on_where_its_file_stops(
     path, arms = tmp_path / "found.json", ["CPS 0.4", BEST, RECORDINGS]
     bags = ["--context-bags", str(bag), "--heldout-bags", str(bag), "--video-model", str(model)]
     size = ["--contexts", "2", "--eval-contexts", "2", "--iterations", "1"]
-    more = ["--learning-rate", "3e-3", "--arms", *arms, "--json", str(path)]
-    call = ["benchmark", "video-rl", "closed-loop", *bags, *size, *more, "--models", str(tmp_path / "kept")]
+    more = ["--learning-rate", "3e-3", "--samplers", *arms, "--json", str(path)]
+    call = ["benchmark", "closed-loop", *bags, *size, *more, "--models", str(tmp_path / "kept")]
     assert main([*call, "--seeds", "0"]) == 0
     rows = json.loads(path.read_text())["rows"]
     assert [row["sampler"] for row in rows] == arms and {row["learning_rate"] for row in rows} == {3e-3}

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from model_folders import make_model_folder, make_stepped_folder, write_starts
 
-from benchmarks.environments.cli import differing, is_finished
+from benchmarks.environments.experiments import differing, is_finished
 from benchmarks.environments.policies import (
     SIMULATOR,
     WORLD_MODEL,
     Workplace,
-    measure_speed,
     rank_policies,
     spearman,
     train_in,
@@ -25,6 +24,8 @@ from wm_nodes.core.files import file_sha256
 from wm_nodes.policy_rl.factories import make_policy
 from wm_nodes.policy_rl.initial_policy import start_files
 from wm_nodes.training.weights import save_weights
+
+SMALL = {"simulation.max_episode_steps": 12, "evaluation.episodes": 2}
 
 
 def test_the_rank_correlation_is_that_of_a_number_worked_by_hand() -> None:
@@ -54,7 +55,7 @@ def test_each_model_is_ranked_against_the_simulator() -> None:
 
 @pytest.fixture
 def work(tmp_path: Path) -> Workplace:
-    config = load_config("smoke")
+    config = load_config("smoke", SMALL)
     work = Workplace(config, make_model_folder(tmp_path / "model"), tmp_path / "push_cube_0")
     starts, weak = start_files(work.folder)
     weak.parent.mkdir(parents=True)
@@ -63,6 +64,7 @@ def work(tmp_path: Path) -> Workplace:
     return work
 
 
+@pytest.mark.slow
 @pytest.mark.rendering
 def test_the_control_is_trained_and_measured_in_the_simulator(work: Workplace) -> None:
     row, ppo = train_in(work, SIMULATOR), work.config.ppo
@@ -73,19 +75,16 @@ def test_the_control_is_trained_and_measured_in_the_simulator(work: Workplace) -
     assert trained.parent.name == "simulator" and file_sha256(trained) != file_sha256(work.start[1])
 
 
-def test_speed_and_imagined_success_are_measured_in_each_model(work: Workplace, tmp_path: Path) -> None:
+def test_imagined_success_is_measured_in_each_model(work: Workplace, tmp_path: Path) -> None:
     config = work.config
     models = [WORLD_MODEL, str(make_stepped_folder(tmp_path / "video_model"))]
-    rows = measure_speed(work, models, num_steps=2)
-    assert [(row["model"], row["envs"]) for row in rows] == [(model, config.ppo.num_envs) for model in models]
-    assert rows[0]["of_world_model"] == 1 and rows[1]["of_world_model"] > 0
     imagined = [work.imagined(work.policy(), work.environment(model)) for model in models]
     assert [result.episodes for result in imagined] == [8 * config.evaluation.episodes] * 2
     assert imagined[1].successes > 0
 
 
 def row_of(work: Workplace, model: str = WORLD_MODEL, **changes: object) -> dict[str, Any]:
-    config = load_config("smoke", changes)
+    config = load_config("smoke", SMALL | changes)
     other = Workplace(config, work.model_dir, work.folder)
     return {"real_before": {}, **json.loads(json.dumps(other.identity(model, ["train"])))}
 
@@ -95,7 +94,7 @@ def test_a_row_is_known_by_every_setting_by_the_models_and_by_the_scenes(work: W
     assert is_finished([row], work.identity(WORLD_MODEL, ["train"]))
     assert not is_finished([row], work.identity(WORLD_MODEL, [])) and not is_finished([row], work.identity(SIMULATOR))
     for changes in ({"ppo.learning_rate": 1e-5}, {"evaluation.episodes": 3}, {"seed": 1}, {"ppo.advantage": "group"}):
-        other = Workplace(load_config("smoke", changes), work.model_dir, work.folder)
+        other = Workplace(load_config("smoke", SMALL | changes), work.model_dir, work.folder)
         assert not is_finished([row], other.identity(WORLD_MODEL, ["train"])), changes
     video = make_stepped_folder(tmp_path / "video_model")
     assert len(work.identity(str(video))["models_sha256"]) == 2
@@ -115,9 +114,10 @@ def test_trained_in_prints_acceptance_keeps_refused_rows_and_trains_again_only_b
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model, file = make_model_folder(tmp_path / "model"), tmp_path / "rows.json"
-    words = ["benchmark", "environments", "trained-in", "--preset", "smoke", "--model-dir", str(model), "--seeds", "0",
+    words = ["benchmark", "trained-in", "--preset", "smoke", "--model-dir", str(model), "--seeds", "0",
              "--json", str(file), "--work", str(tmp_path / "work"), "--set", "data.num_workers=1",
-             "--set", "evaluation.episodes=2", "--set", "acceptance.num_episodes=2"]
+             "--set", "evaluation.episodes=2", "--set", "acceptance.num_episodes=2",
+             "--set", "acceptance.clone_episodes=2", "--set", "simulation.max_episode_steps=12"]
 
     def rows() -> list[dict[str, Any]]:
         found: list[dict[str, Any]] = json.loads(file.read_text(encoding="utf-8"))["rows"]

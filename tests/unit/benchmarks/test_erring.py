@@ -139,10 +139,10 @@ def test_the_command_prints_and_writes_every_way_against_the_agent(
     monkeypatch.setattr(erring, "load_check_set", lambda folder: clips[:6])
     monkeypatch.setattr(erring, "RATES", (0.1,))
     target = tmp_path / "erring.json"
-    assert main(["benchmark", "judge", "erring", "--seeds", "2", "--json", str(target)]) == 0
+    assert main(["benchmark", "erring", "--seeds", "2", "--json", str(target)]) == 0
     shown, found = capsys.readouterr().out, json.loads(target.read_text())
     assert "10% of reads err, correlation 0.5, overconfident" in shown and "per audited clip" in shown
-    assert found["command"] == f"wm benchmark judge erring --seeds 2 --json {target}"
+    assert found["command"] == f"wm benchmark erring --seeds 2 --json {target}"
     assert len(found["ways"]) == 6 * len(PACKS) and len(found["audits"]) == 12
     assert found["audit_shares"] == {"votes": 0.05, "looks": 0.05}
     for row in found["ways"]:
@@ -151,5 +151,5 @@ def test_the_command_prints_and_writes_every_way_against_the_agent(
 
 
 def test_a_folder_without_a_set_is_one_clear_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["benchmark", "judge", "erring", str(tmp_path)]) == 2
+    assert main(["benchmark", "erring", "--check-set", str(tmp_path)]) == 2
     assert "cannot be used" in capsys.readouterr().err

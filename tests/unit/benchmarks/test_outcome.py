@@ -20,6 +20,7 @@ def rows_of(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
+@pytest.mark.slow
 def test_the_command_trains_measures_the_kept_weights_and_goes_on_where_its_file_stops(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -27,8 +28,8 @@ def test_the_command_trains_measures_the_kept_weights_and_goes_on_where_its_file
     (bag,) = collect_plan(scripted_plan(scene, 3, HELDOUT), scene, tmp_path / "bags")
     path, kept = tmp_path / "found.json", tmp_path / "weights"
     call = [
-        "benchmark", "video-rl", "outcome", "--context-bags", str(bag), "--heldout-bags", str(bag), "--iterations", "1",
-        "--eval-contexts", "2", "--weights", str(kept), "--json", str(path), "--arms", *ARMS,
+        "benchmark", "outcome", "--context-bags", str(bag), "--heldout-bags", str(bag), "--iterations", "1",
+        "--eval-contexts", "2", "--weights", str(kept), "--json", str(path), "--samplers", *ARMS,
     ]
     assert main([*call, "--seeds", "0"]) == 0
     first = rows_of(path)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from benchmarks.speed import cli
+from benchmarks.speed import speed
 from benchmarks.speed.inputs import actions_of, interleave, seeds_of
 from benchmarks.speed.noop_environment import make_noop_environment
 from benchmarks.speed.simulator import rate_episode
@@ -46,7 +46,7 @@ def test_the_costless_environment_never_ends_so_that_every_step_counts() -> None
 def test_a_simulator_that_was_not_measured_is_shown_with_the_reason_and_no_number(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli, "console", Console(width=200))
+    monkeypatch.setattr(speed, "console", Console(width=200))
     times = ("dds_step", "in_process_step", "growth_first", "growth_last", "growth_first_p10", "growth_last_p10")
     graph = {"num_envs": 16, "image": "64x128", "threads_each": 1, "overhead_95": (1.0, 1.1), "pairs": 3,
              "growth_steps": 9, **{f"{name}_ms": 1.0 for name in times}}
@@ -57,12 +57,12 @@ def test_a_simulator_that_was_not_measured_is_shown_with_the_reason_and_no_numbe
         "simulator": {"missing": "", "simulator_processes": 2, "simulator_steps_per_s": 100.0, "imagined_envs": 64,
                       "reward": "endogenous"},
     }
-    cli.show(found)
+    speed.show(found)
     ours, stock = (line for line in capsys.readouterr().out.splitlines() if "imagined_over" in line)
     assert "6.4" in ours and "2 processes: 100.0 steps/s" in ours
     assert "-" in stock and "ManiSkill has no such task" in stock
     simulator = found["simulator"] | {"missing": "no Vulkan device"}
-    cli.show(found | {"imagined_over_simulator": None, "simulator": simulator})
+    speed.show(found | {"imagined_over_simulator": None, "simulator": simulator})
     assert capsys.readouterr().out.count("no Vulkan device") == 2
 
 
@@ -73,5 +73,10 @@ def test_a_simulator_that_was_not_measured_is_shown_with_the_reason_and_no_numbe
 def test_an_untrained_model_of_an_impossible_size_is_refused_before_anything_is_measured(
     value: str, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["benchmark", "speed", "--preset", "smoke", "--untrained", value]) == 2
+    assert main(["benchmark", "speed", "--preset", "smoke", "--untrained", "--set", value]) == 2
     assert words in capsys.readouterr().err
+
+
+def test_settings_without_an_untrained_model_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["benchmark", "speed", "--set", "world_model.width=96"]) == 2
+    assert "are of a model with random weights" in capsys.readouterr().err

@@ -3,7 +3,6 @@
 import json
 import re
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +11,15 @@ import numpy as np
 import pytest
 from chat_server import ChatServer, Fault
 from judge_server import serving
-from scripted_judge import make_clip, make_task
 
 from benchmarks.judge.success_clips import (
     f1,
-    log_p_true,
-    prefixes,
     read_roboreward,
     read_table,
     score_errors,
     success_numbers,
 )
 from wm_nodes.apps.cli import main
-from wm_nodes.config.load import default_judge
-from wm_nodes.config.schema import JudgeConfig
-from wm_nodes.judge.service import ClipJob, JudgeService
 
 NAN = float("nan")
 P_TRUE = {"a": 0.9, "b": 0.2, "c": 0.6, "d": 0.6}
@@ -68,8 +61,9 @@ def bench(tmp_path: Path) -> Path:
 
 def measured(folder: Path, *options: str) -> dict[str, Any]:
     with serving(ByTask()) as server:
-        command = ["benchmark", "judge", "success-clips", str(folder), "--judge", server.url, "--judge-model", "judge"]
-        assert not main([*command, "--mode", "topreward", "--json", str(folder / "found.json"), *options])
+        command = ["benchmark", "success-clips", "--folder", str(folder), "--mode", "topreward"]
+        judge = ["--judge", server.url, "--judge-model", "judge"]
+        assert not main([*command, *judge, "--json", str(folder / "found.json"), *options])
     return dict(json.loads((folder / "found.json").read_text()))
 
 
@@ -82,13 +76,8 @@ def test_roborewardbench_is_read_as_published_and_scored_by_mae(bench: Path) -> 
     assert found["accuracy"][0] == pytest.approx(3 / 4) and found["f1"][0] == pytest.approx(4 / 5)
     assert found["auroc"][0] == pytest.approx(3.5 / 4)
     assert all(low <= value <= high for value, low, high in (found[n] for n in ("mae", "accuracy", "f1", "auroc")))
-    assert found["mode"] == "topreward" and found["rubric"].startswith("topreward-1-") and "voc" not in found
+    assert found["mode"] == "topreward" and found["rubric"].startswith("topreward-1-")
     assert measured(bench / "test", "--format", "roboreward", "--clips", "2")["clips"] == 2
-
-
-def test_prefixes_give_the_value_order_correlation_of_the_successes(bench: Path) -> None:
-    found = measured(bench, "--format", "roboreward", "--prefixes", "4")
-    assert found["curves"] == 2 and found["voc"][0] == pytest.approx(1.0)
 
 
 def test_a_table_of_success_labels_is_read_and_has_no_score(bench: Path) -> None:
@@ -123,26 +112,3 @@ def test_a_list_that_is_missing_or_wrong_is_named_with_its_line_and_the_remedy(
         (tmp_path / file).write_text(text)
     with pytest.raises(ValueError, match=re.escape(problem)):
         read(tmp_path)
-
-
-def test_prefixes_grow_to_the_whole_clip() -> None:
-    clip = make_clip(0, 12)
-    parts = prefixes(clip, 4)
-    assert [len(part.frames) for part in parts] == [2, 5, 9, 12] and parts[-1].sha256 == clip.sha256
-    assert [len(part.frames) for part in prefixes(make_clip(0, 3), 15)] == [2, 3]
-
-
-def test_progress_is_the_log_of_what_the_token_true_had_before_normalising() -> None:
-    clip = make_clip(0, 12)
-    with serving(ChatServer(labels={"True": 0.5, " True": 0.1, "False": 0.2, "The": 0.2})) as server:
-        chosen = {"endpoints": [server.url], "model": "judge", "tries": 1, "mode": "topreward"}
-        config = JudgeConfig.model_validate({**default_judge().model_dump(), **chosen})
-        with closing(JudgeService(config, seed=0)) as judge:
-            (verdict,) = judge.judge([ClipJob(clip, make_task(clip))])
-    assert log_p_true(verdict) == pytest.approx(np.log(0.6))
-
-
-def test_prefixes_of_the_staged_agent_are_refused(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["benchmark", "judge", "success-clips", str(bench), "--format", "roboreward", "--prefixes", "3"]
-    assert main([*command, "--judge", "http://127.0.0.1:9/v1", "--judge-model", "m"]) == 2
-    assert "--prefixes 3 needs --mode topreward" in capsys.readouterr().err

@@ -78,7 +78,7 @@ def test_a_file_without_permission_is_named(tmp_path: Path) -> None:
         f"os.chdir({str(tmp_path)!r}); os.setuid({NOBODY})\n"
         "try: read_yaml(Path('secret.yaml'))\nexcept ValueError as error: print(error)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "secret.yaml cannot be read: Permission denied; make it readable, or name another file\n"
 
 
@@ -122,7 +122,7 @@ def test_a_node_ends_with_one_line(kind: str, tmp_path: Path) -> None:
     path = make(tmp_path, kind)
     code = "import sys; from wm_nodes.ros.spin import run_nodes; sys.exit(run_nodes(lambda: []))"
     command = [sys.executable, "-c", code, "--ros-args", "--params-file", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1 and done.stderr.count("\n") == 1, done.stderr
     assert done.stderr.startswith(f"error: {path}")
 

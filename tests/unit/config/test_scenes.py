@@ -4,10 +4,10 @@ import pytest
 
 from wm_nodes.config.load import ConfigError, load_config
 from wm_nodes.config.scenes import COLOURS, CONTAINERS, SCENES, SHAPES, TABLES, scene_of, scenes_of, splits
-from wm_nodes.config.tasks import get_task, instruction, task_names
+from wm_nodes.config.tasks import get_task, instruction, simulator_part, task_names
 from wm_nodes.world_model.text import MAX_WORDS
 
-IN_SCENES = [task for task in task_names() if get_task(task).instruct]
+IN_SCENES = [task for task in task_names() if simulator_part(task).instruct]
 PAIRS = {(container, table) for container in CONTAINERS for table in TABLES}
 
 

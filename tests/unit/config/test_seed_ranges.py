@@ -2,6 +2,7 @@
 
 import re
 from itertools import pairwise
+from typing import Any
 
 import pytest
 from metric_docs import DOCUMENT
@@ -20,7 +21,7 @@ from wm_nodes.config.seed_ranges import (
     seed_spans,
 )
 from wm_nodes.config.tasks import WeakPolicy
-from wm_nodes.environments.maniskill.collection import CollectionPlan
+from wm_nodes.environments.collection import CollectionPlan
 from wm_nodes.environments.record import acceptance_plan, demonstration_plan
 from wm_nodes.policy_rl.initial_policy import starts_plan
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
@@ -77,9 +78,10 @@ def test_an_evaluation_on_seeds_of_another_purpose_is_refused(first_seed: int) -
 
 
 def test_the_last_episode_of_an_evaluation_counts_too() -> None:
-    assert EvaluationConfig(episodes=200, first_seed=EVALUATION.stop - 200, deterministic=True).episodes == 200
+    given: dict[str, Any] = {"environment": "none", "first_seed": EVALUATION.stop - 200, "deterministic": True}
+    assert EvaluationConfig(episodes=200, **given).episodes == 200
     with pytest.raises(ValueError, match="201 evaluation episodes from reset seed 1999800"):
-        EvaluationConfig(episodes=201, first_seed=EVALUATION.stop - 200, deterministic=True)
+        EvaluationConfig(episodes=201, **given)
 
 
 @pytest.mark.parametrize(("first", "count"), [(999_999, 2), (1_500_000, 1), (0, 1_000_001), (-1, 1)])

@@ -4,24 +4,43 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from own_packages import write_package
+from pushing_scene import episode
 
 import wm_nodes
 from wm_nodes.apps import cli
-from wm_nodes.config.load import ConfigError, default_task, load_config
-from wm_nodes.config.tasks import VARIABLE, get_task, model_tasks, recorded_task, shares_scene, task_names
+from wm_nodes.config.load import ConfigError, load_config
+from wm_nodes.config.tasks import (
+    VARIABLE,
+    default_task,
+    get_task,
+    is_simulated,
+    model_tasks,
+    recorded_task,
+    shares_scene,
+    success,
+    task_names,
+)
 from wm_nodes.environments.maniskill.spec import simulation_spec
+from wm_nodes.recording.episode_arrays import stack_episodes
 
+FOLD = """\
+from wm_nodes.config.tasks import Task
+
+TASK = Task(instruction="fold the towel")
+"""
 TASKS = ("pull_cube", "push_cube", "reach")
 IN_SCENES = ("move_to_aim", "pick_place", "pull", "push", "reach_object")
 ALL = "all_tasks"
 """Those of the procedural scenes, and the one whose episodes are of all of them."""
-NAMED_IN = {"launching/scenarios.py", "environments/maniskill/objects.py", "judge/clip_files.py", "apps/judge_clips.py",
+NAMED_IN = {"environments/maniskill/objects.py", "judge/clip_files.py", "apps/judge_clips.py",
             "policy_rl/train.py"}
-"""The default task of launch files, those that share a model, two lines of clips.jsonl, an example."""
+"""Those that share a model, two lines of clips.jsonl, an example."""
 
 
 @pytest.mark.parametrize(
@@ -53,8 +72,25 @@ def test_tasks_in_one_scene_share_their_episodes_and_the_others_have_their_own()
 @pytest.mark.parametrize("task", TASKS + IN_SCENES)
 def test_a_task_belongs_to_its_model_and_its_seeds_are_its_own(task: str) -> None:
     assert task in model_tasks(task) and {model_tasks(other) for other in model_tasks(task)} == {model_tasks(task)}
-    numbers = [policy.number for other in model_tasks(task) for policy in get_task(other).weak_policies]
+    numbers = [policy.number for other in model_tasks(task) for policy in get_task(other).model.weak_policies]
     assert len(numbers) == len(set(numbers)) > 0
+
+
+def test_a_robots_task_is_its_instruction_and_success_is_what_was_recorded(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    write_package(tmp_path, "robot_tasks", fold=FOLD)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv(VARIABLE, "robot_tasks")
+    config = load_config("cpu", {"task": "fold"})
+    assert get_task("fold").instruction == "fold the towel" and config.task == "fold"
+    assert not is_simulated("fold") and shares_scene("fold", "fold") and not shares_scene("reach", "fold")
+    with pytest.raises(ValueError, match="'fold' has no `simulator` in its file"):
+        simulation_spec("fold", config.simulation, 1)
+    with pytest.raises(ValueError, match="'fold' has no success rule"):
+        success("fold", np.zeros((1, 0), np.float32))
+    recorded = replace(episode(0), task="fold", success=np.arange(13) == 12)
+    assert stack_episodes([recorded], ("fold",)).success[0, :, 0].tolist() == [False] * 12 + [True]
 
 
 def test_no_module_but_its_file_knows_a_task_by_its_name() -> None:
@@ -83,7 +119,7 @@ def test_launch_files_list_the_tasks_of_a_further_package(tmp_path: Path) -> Non
         [sys.executable, "-c", code], capture_output=True, text=True, check=True,
         env={**os.environ, VARIABLE: "launched_tasks", "PYTHONPATH": path},
     )
-    assert done.stdout == f"{tuple(sorted(('pour', *TASKS, *IN_SCENES, ALL)))}\n"
+    assert done.stdout == f"{('', *sorted(('pour', *TASKS, *IN_SCENES, ALL)))}\n"
 
 
 def test_the_command_line_and_the_settings_name_the_known_tasks(

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from deadlines import within
 
 from wm_nodes.core.named_files import (
     RUBRIC,
@@ -124,7 +125,7 @@ def test_only_regular_files_within_the_limit_are_read_and_nothing_waits(run: Pat
                 files.read("sparse", RUBRIC)
     with pytest.raises(FileNotFoundError):
         files.read("absent", WEIGHTS)
-    assert time.monotonic() - began < 5
+    assert time.monotonic() - began < within(5)
 
 
 def test_a_file_that_hides_its_size_is_read_up_to_the_limit() -> None:
@@ -223,7 +224,7 @@ def test_a_file_system_that_does_not_answer_gives_an_error_after_the_deadline(ru
         began = time.monotonic()
         with pytest.raises(FileRefused, match=r"x' cannot be read: no answer for 0\.3 s; is its disk there\?"):
             ask(NamedFiles(run, [dead_disk], stall_s=0.3))
-        assert 0.25 < time.monotonic() - began < 3
+        assert 0.25 < time.monotonic() - began < within(3)
         with pytest.raises(OutsideFolders):
             ask(NamedFiles(run, stall_s=0.3))
     assert NamedFiles(run, [dead_disk], stall_s=5).read("inside.txt", SMALL) == b"inside"

@@ -117,4 +117,4 @@ def test_the_world_model_says_where_its_cameras_are_and_starts_no_simulator(tmp_
     moved = [wrist.pose_in(n)[:3, 3] - before[n][:3, 3] for n in range(2)]
     np.testing.assert_allclose(moved, [[0, 0, 0], [0, 0.5 * config.simulation.max_action_m, 0]], atol=1e-6)
     loaded = "import sys, wm_nodes.policy_rl.factories; sys.exit('sapien' in sys.modules)"
-    subprocess.run([sys.executable, "-c", loaded], check=True, timeout=100)
+    subprocess.run([sys.executable, "-c", loaded], check=True)

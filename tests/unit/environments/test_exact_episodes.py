@@ -88,6 +88,7 @@ def test_physics_that_is_not_renewed_remembers_earlier_episodes(one: Watched) ->
     assert any(not np.array_equal(*pair) for pair in zip(episodes[1:], renewed[1:], strict=True))
 
 
+@pytest.mark.slow
 def test_evaluation_does_not_depend_on_the_number_of_simulators(one: Watched, three: Watched) -> None:
     policy = pushing_policy()
     results = [evaluate(policy, env, 5, 1_000_000, deterministic=False) for env in (one, three)]

@@ -30,10 +30,10 @@ from wm_nodes.recording import read_episodes
 from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.recording.reader import read_spec
 from wm_nodes.world_model import load_model_folder, save_model_folder
-from wm_nodes.world_model.tokenizer import PROBE_NAMES
+from wm_nodes.world_model.positions import columns_of, probe_targets
 from wm_nodes.world_model.training.dynamics import train_action_model
 from wm_nodes.world_model.training.position_probe import train_position_probe
-from wm_nodes.world_model.training.tokenizer import probe_targets, train_tokenizer
+from wm_nodes.world_model.training.tokenizer import train_tokenizer
 
 RECORDINGS = 16
 pytestmark = pytest.mark.rendering
@@ -43,6 +43,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from wm_nodes.config.tasks import ModelPart, SimulatorPart
 from wm_nodes.environments.maniskill import table_top
 from wm_nodes.environments.maniskill.tasks import push_cube
 
@@ -69,14 +70,11 @@ def script(behaviour, truth, rng, max_action_m):
 TASK = replace(
     push_cube.TASK,
     instruction="nudge the blue cube",
-    scene=scene,
     ground_truth_names=("travel", *table_top.GROUND_TRUTH_NAMES),
-    measure=measure,
     success=lambda truth: truth[..., 0] > 0.01,
-    waypoints=lambda truth: push_cube.push_waypoints(truth[1:]),
-    script=script,
     settings={"sft.num_demonstrations": 2, "judge.rubric": "robot_no_physics", "data.behaviours": {"expert": 1.0}},
-    model_tasks=(),
+    simulator=SimulatorPart(scene, measure, lambda truth: push_cube.push_waypoints(truth[1:]), script),
+    model=ModelPart(positions=table_top.POSITIONS),
 )
 '''
 
@@ -116,9 +114,10 @@ def test_its_demonstrations_are_recorded_and_what_a_world_model_probes_is_found_
     assert (episode.task, episode.instruction, episode.behaviour) == ("nudge", "nudge the blue cube", "expert")
     assert episode.success[-1] and episode.ground_truth.shape[1] == 12
     probed = probe_targets(episode.ground_truth, "nudge")
-    np.testing.assert_array_equal(probed[:, PROBE_NAMES.index("object_x")], episode.ground_truth[:, 1])
+    np.testing.assert_array_equal(probed[:, columns_of("nudge", "object")[0]], episode.ground_truth[:, 1])
 
 
+@pytest.mark.slow
 def test_a_judge_of_its_recordings_decides_whether_it_is_done_and_refuses_what_they_never_show(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

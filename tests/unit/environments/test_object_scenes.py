@@ -10,7 +10,7 @@ from transforms3d.quaternions import mat2quat, qinverse, qmult, quat2axangle
 from wm_nodes.config.load import load_config
 from wm_nodes.config.scenes import SCENES, scene_of
 from wm_nodes.config.seed_ranges import HELDOUT, MODEL_EPISODES
-from wm_nodes.config.tasks import get_task, success
+from wm_nodes.config.tasks import get_task, simulator_part, success
 from wm_nodes.core.rotations import multiply, to_quaternion
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.tool_control import hold_actions, next_state
@@ -140,7 +140,7 @@ def test_a_seed_gives_the_same_bits_after_other_episodes_and_in_another_slot(bli
         """The script of `push` in one slot, the others stay ended or where they are; ground truth of every step."""
         mask = np.arange(env.spec.num_envs) == slot
         observation = env.reset(mask, np.full(env.spec.num_envs, seed, np.uint64))
-        act = get_task("push").script("expert", env.ground_truth[slot], numpy_stream(seed, "behaviour"), 0.1)
+        act = simulator_part("push").script("expert", env.ground_truth[slot], numpy_stream(seed, "behaviour"), 0.1)
         seen = [env.ground_truth[slot]]
         for _ in range(12):
             actions = hold_actions(observation.state, env.spec)
@@ -179,7 +179,7 @@ def test_the_script_of_a_task_succeeds_from_a_start_that_does_not(task: str) -> 
         episode = scripted_episode(env, "expert", seed, seed)
         assert episode.terminated and episode.success[-1] and not episode.success[0], (seed, env.shown_scenes)
         shown = scene_of("train", seed)
-        instruct = get_task(task).instruct
+        instruct = simulator_part(task).instruct
         assert shown and instruct and episode.instruction == instruct(shown)
         assert episode.actions.shape[1] == episode.states.shape[1] == 7
     assert not scripted_episode(env, "random", 1, 4).success[0]
@@ -191,7 +191,7 @@ def test_the_script_of_a_task_succeeds_from_a_start_that_does_not(task: str) -> 
 @pytest.mark.rendering
 def test_a_grasped_object_is_lifted_and_known_to_be_grasped(env: ManiSkillEnvironment) -> None:
     start(env, 1)
-    act = get_task("pick_place").script("expert", env.ground_truth[0], numpy_stream(1, "behaviour"), 0.1)
+    act = simulator_part("pick_place").script("expert", env.ground_truth[0], numpy_stream(1, "behaviour"), 0.1)
     lifted = False
     for _ in range(20):
         truths = env.step(act(env.ground_truth[0], env.current().state[0])[None]).ground_truth[0]

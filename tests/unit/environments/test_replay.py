@@ -9,8 +9,8 @@ from wm_nodes.config.load import load_config
 from wm_nodes.core.types import Episode
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.episodes import scripted_episode
-from wm_nodes.environments.maniskill.replay import execute_paths
 from wm_nodes.environments.maniskill.table_top import CUBE, TOOL
+from wm_nodes.environments.replay import execute_paths
 
 SIMULATION = load_config("cpu").simulation
 STRIDE = 2

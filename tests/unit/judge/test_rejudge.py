@@ -92,6 +92,7 @@ def test_rewards_that_the_agent_gave_come_out_again_and_one_unit_in_the_last_pla
     assert other.compared == 0, "rewards of another judge are not compared"
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_line_per_episode_and_names_what_is_wrong(
     server: PickyServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from deadlines import PATIENCE_S
 from graph.video_loop import write_contexts
 from judge_server import PickyServer
 from recording_samples import make_spec
@@ -23,12 +24,13 @@ from wm_nodes.apps.cli import main
 from wm_nodes.config.load import default_judge, dump_config, judge_overrides, load_config, load_video_config
 from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.lockstep import LockStep
 from wm_nodes.core.named_files import NamedFiles, OutsideFolders
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.reading import read_record
 from wm_nodes.judge.backends.factory import check_judge
-from wm_nodes.judge.episode_reward import EpisodeReward, EpisodeStep, PendingReward, check_horizon, unjudged_reason
+from wm_nodes.judge.episode_reward import EpisodeReward, PendingReward, check_horizon, unjudged_reason
 from wm_nodes.judge.service import ClipJob, JudgeService
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.graph import GraphError
@@ -128,16 +130,22 @@ def test_a_rubric_that_is_refused_leaves_the_one_before(server: PickyServer, tmp
 
 
 def step(number: int, *, ended: tuple[bool, bool] = (False, False), ids: tuple[int, int] = (1, 2),
-         numbers: tuple[int, int] | None = None, lost: bool = False) -> EpisodeStep:
+         numbers: tuple[int, int] | None = None, lost: bool = False) -> LockStep:
     images = np.random.default_rng(number).integers(0, 256, (2, 2, 8, 8, 3), np.uint8)
-    return EpisodeStep(
-        None if lost else images[0], images[1], np.full((2, 3), 0.5, np.float32), np.array(ids, np.uint64),
-        np.array(numbers or (number, number), np.uint32), np.array(ended), np.ones(2, bool),
+    zeros, none = np.zeros(2, np.float32), np.zeros(2, bool)
+    return LockStep(
+        session=7, step_id=number, stamp_ns=10 * number, next_stamp_ns=10 * number + 10,
+        actions=np.full((2, 3), 0.5, np.float32), states=np.zeros((2, 3), np.float32),
+        next_states=np.zeros((2, 3), np.float32), logprobs=zeros, values=zeros, terminated=np.array(ended),
+        truncated=none, valid=~none, episode_ids=np.array(ids, np.uint64),
+        episode_steps=np.array(numbers or (number, number), np.uint32), policy_versions=np.zeros(2, np.uint64),
+        success_probability=zeros, uncertainty=zeros, ground_truth=np.zeros((2, 0), np.float32), source=0,
+        images=None if lost else images[0], next_images=images[1],
     )
 
 
 def wait_for(pending: PendingReward) -> PendingReward:
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + PATIENCE_S
     while not pending.done:
         assert time.monotonic() < deadline
         time.sleep(0.01)
@@ -155,10 +163,11 @@ def test_an_episode_is_paid_at_its_last_step_and_not_before(server: PickyServer)
     with closing(Listening(settings(server), seed=0)) as judge:
         model = EpisodeReward(judge)
         goal = np.full((8, 8, 3), 7, np.uint8)
-        first, second = replace(step(0), goals={0: goal}), step(1, ended=(True, False))
-        early = model.add(first, SPEC, 7)
+        goals = np.stack([goal, goal]), np.array([True, False])
+        first, second = replace(step(0), goals=goals), step(1, ended=(True, False))
+        early = model.add(first, SPEC)
         assert early.done and list(early.result().total) == [0, 0] and list(early.result().valid) == [True, True]
-        late = wait_for(model.add(second, SPEC, 7))
+        late = wait_for(model.add(second, SPEC))
         (verdict,) = late.verdicts().values()
         result = late.result()
         assert list(result.total) == [np.float32(verdict.reward), 0] and list(result.valid) == [True, True]
@@ -183,11 +192,11 @@ def test_an_episode_is_paid_at_its_last_step_and_not_before(server: PickyServer)
     ids=["image_lost", "beginning_unseen", "step_missed"],
 )
 def test_an_episode_that_was_not_seen_whole_has_no_reward_and_is_not_judged(
-    server: PickyServer, steps: list[EpisodeStep], words: str
+    server: PickyServer, steps: list[LockStep], words: str
 ) -> None:
     with closing(JudgeService(settings(server), seed=0)) as judge:
         model = EpisodeReward(judge)
-        result = [wait_for(model.add(one, SPEC, 7)) for one in steps][-1].result()
+        result = [wait_for(model.add(one, SPEC)) for one in steps][-1].result()
         assert list(result.valid) == [False, True] and np.isnan(result.total[0]) and words in result.invalid_reason
         assert not server.requests
 
@@ -195,8 +204,8 @@ def test_an_episode_that_was_not_seen_whole_has_no_reward_and_is_not_judged(
 def test_an_episode_that_was_cut_short_leaves_nothing_to_the_next_one(server: PickyServer) -> None:
     with closing(JudgeService(settings(server), seed=0)) as judge:
         model = EpisodeReward(judge)
-        model.add(step(0), SPEC, 7)
-        pending = model.add(step(0, ids=(3, 4), ended=(True, False)), SPEC, 7)
+        model.add(step(0), SPEC)
+        pending = model.add(step(0, ids=(3, 4), ended=(True, False)), SPEC)
         assert wait_for(pending).verdicts()[0].clip_id == "episode 3 of session 7"
         assert model.cut == 2 and list(pending.result().valid) == [True, True]
         model.forget()
@@ -243,7 +252,7 @@ def test_a_cut_episode_is_worth_what_the_critic_says_and_an_ended_one_its_verdic
 def test_a_judge_that_is_down_leaves_the_last_step_without_a_reward_and_says_why(server: PickyServer) -> None:
     server.down = True
     with closing(JudgeService(settings(server), seed=0)) as judge:
-        result = wait_for(EpisodeReward(judge).add(step(0, ended=(True, True)), SPEC, 7)).result()
+        result = wait_for(EpisodeReward(judge).add(step(0, ended=(True, True)), SPEC)).result()
         assert not result.valid.any() and np.isnan(result.total).all()
         assert "environment 1: ERROR PLAN" in result.invalid_reason and "connection failed" in result.invalid_reason
 

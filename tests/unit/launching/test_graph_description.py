@@ -160,7 +160,7 @@ def test_the_learner_knows_what_is_imagined_from_for_its_exploit_meter(given: di
     assert learner()["starts_file"] == starts and "video_model_dir" not in learner()
     video = learner(backend="video_model")
     assert (video["starts_file"], video["video_model_dir"]) == (starts, given["video_model_dir"])
-    assert "starts_file" not in learner(backend="maniskill")
+    assert "starts_file" not in learner(backend="environment")
 
 
 def test_learner_of_several_ranks_is_not_composed(given: dict[str, str]) -> None:
@@ -179,7 +179,7 @@ def test_graph_of_the_run_is_kept_as_json(given: dict[str, str]) -> None:
     ("wrong", "message"),
     [
         ({"colour": "red"}, "unknown argument 'colour'"),
-        ({"backend": "gazebo"}, "backend must be one of world_model, video_model, maniskill, factory; got 'gazebo'"),
+        ({"backend": "gazebo"}, "backend must be one of world_model, video_model, environment; got 'gazebo'"),
         ({"num_envs": "many"}, "num_envs must be a whole number, got 'many'"),
         ({"domain_id": "102"}, "domain_id must be 0 to 101, got 102"),
         ({"model_dir": "/nowhere"}, "holds no manifest.json"),

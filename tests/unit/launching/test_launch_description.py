@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from wm_nodes.config.load import load_config
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.graph import Graph, GraphError
 from wm_nodes.launching.launch_description import prepare_graph
@@ -92,21 +93,34 @@ def test_every_node_of_every_way_to_start_has_the_limit_of_its_memory(given: dic
 def test_plug_ins_and_a_parameter_file_reach_the_nodes(given: dict[str, str], tmp_path: Path) -> None:
     file = tmp_path / "more.yaml"
     file.write_text("/**:\n  ros__parameters:\n    peer_timeout_s: 9.0\n")
-    more = {
-        "backend": "factory", "backend_factory": "robot:make", "policy_factory": "mine:policy",
-        "reward_factory": "mine:reward", "params_file": str(file),
-    }
-    graph, _ = launch_arguments.prepare("rollout_record", {**given, **more})
-    assert graph.node("environment").parameters["backend_factory"] == "robot:make"
-    assert graph.node("policy").parameters["policy_factory"] == "mine:policy"
-    assert graph.node("reward_evaluator").parameters["reward_factory"] == "mine:reward"
+    more = {"backend": "environment", "params_file": str(file),
+            "set": "environment.factory=robot:make; policy.factory=mine:policy;reward.factory=mine:reward"}
+    graph, values = launch_arguments.prepare("rollout_record", {**given, **more})
+    assert graph.node("environment").parameters["backend"] == "environment"
+    config = load_config(values["config_file"])
+    factories = config.environment.factory, config.policy.factory, config.reward.factory
+    assert factories == ("robot:make", "mine:policy", "mine:reward")
     assert all(node.ros_arguments()[-2:] == ["--params-file", str(file)] for node in graph.nodes)
     graph, _ = launch_arguments.prepare("evaluate", {**given, "initial_policy": "/weights.safetensors"})
     assert graph.node("evaluation").parameters["initial_policy"] == "/weights.safetensors"
-    for scenario, more in (("online_training", {}), ("replay_offline", {"bag_uri": str(tmp_path)})):
-        graph, _ = launch_arguments.prepare(scenario, {**given, **more, "learner_factory": "mine:learner"})
-        assert graph.node("learner").parameters["learner_factory"] == "mine:learner"
-    with pytest.raises(GraphError, match="needs backend_factory"):
-        launch_arguments.prepare("rollout_record", {**given, "backend": "factory"})
+    with pytest.raises(GraphError, match=r"config_file is given, so learner\.factory belong into it"):
+        launch_arguments.prepare(
+            "online_training", {**given, "config_file": values["config_file"], "set": "learner.factory=mine:learner"}
+        )
+
+
+def test_without_a_task_the_model_is_named_and_nothing_is_measured_where_evaluation_is_none(
+    given: dict[str, str]
+) -> None:
+    more = {"task": "", "model_dir": "", "set": "evaluation.environment=none"}
+    with pytest.raises(GraphError, match="no world model is shipped for task ''"):
+        launch_arguments.prepare("online_training", {**given, **more})
+    graph, _ = launch_arguments.prepare("online_training", {**given, **more, "model_dir": given["model_dir"]})
+    assert "evaluation" not in {node.name for node in graph.nodes}
+    graph, _ = launch_arguments.prepare("rollout_record", {**given, **more, "backend": "environment"})
+    assert graph.node("policy").parameters["model_dir"] == ""
+
+
+def test_a_parameter_file_that_is_missing_is_refused(given: dict[str, str]) -> None:
     with pytest.raises(GraphError, match=r"params_file '/no\.yaml' does not exist"):
         launch_arguments.prepare("rollout_record", {**given, "params_file": "/no.yaml"})

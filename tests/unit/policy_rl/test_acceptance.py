@@ -31,6 +31,7 @@ def test_starts_that_the_simulator_does_not_show_are_refused_without_pictures_to
         imagine_and_replay(make_policy(load_config("smoke")), ToyModel(4, 0), ReachToy(1, 0), SEEDS[::-1].copy(), 0)
 
 
+@pytest.mark.slow
 @pytest.mark.rendering
 def test_a_model_is_judged_by_held_out_episodes_and_by_the_cloned_policy_in_it(tmp_path: Path) -> None:
     model, folder = make_model_folder(tmp_path / "model", CONFIG), tmp_path / "heldout"

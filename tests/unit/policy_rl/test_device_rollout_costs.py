@@ -56,10 +56,11 @@ def test_the_devices_rollout_has_the_cpus_numbers(device: Device) -> None:
     assert (np.abs(found.pictures().astype(int) - expected.pictures()).mean()) < 1.0
 
 
+@pytest.mark.slow
 def test_a_lock_step_waits_for_nothing_and_a_rollout_copies_the_same_however_long(device: Device) -> None:
     config = load_config("cpu", {"task": "reach", "device": device.name, "reward.dense_weight": 1.0})
     policy = make_policy(config, MODEL)
-    env = make_training_environment(config, MODEL, MODEL / STARTS, num_envs=4, seed=0)
+    env = make_training_environment(config, MODEL, num_envs=4, seed=0)
     assert isinstance(env, DeviceEnvironment)
     collector = DeviceCollector(env, policy, make_endogenous_reward(config, MODEL))
     assert collector.collect(1, 0, 1).features_TN.device.type == "cuda"

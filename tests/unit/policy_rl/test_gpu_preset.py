@@ -51,7 +51,7 @@ def test_it_trains_a_model_and_a_policy_on_a_device(device: Device, tmp_path: Pa
               "states": torch.from_numpy(episodes.states[:, 0].copy())}
     save_file(starts, folder / "starts.safetensors")
     policy, reward = make_policy(config, folder), make_endogenous_reward(config, folder)
-    env = make_training_environment(config, folder, folder / "starts.safetensors", num_envs=4, seed=0)
+    env = make_training_environment(config, folder, num_envs=4, seed=0)
     rollout = DeviceCollector(env, policy, reward).collect(config.ppo.num_steps, 0, 1)
     before = [parameter.clone() for parameter in policy.parameters()]
     assert rollout.images is not None

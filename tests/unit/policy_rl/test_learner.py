@@ -20,7 +20,8 @@ from wm_nodes.reward import RuleReward
 
 
 def config_of(**ppo: object) -> RunConfig:
-    return load_config("smoke", {"ppo.num_envs": 4, **{f"ppo.{name}": value for name, value in ppo.items()}})
+    chosen = {"learner.factory": "graph.reinforce:make_reinforce", "ppo.num_envs": 4}
+    return load_config("smoke", chosen | {f"ppo.{name}": value for name, value in ppo.items()})
 
 
 def start(config: RunConfig, policy: ImagePolicy, run_dir: Path) -> PolicyTraining:
@@ -42,22 +43,16 @@ def assert_equal(one: ImagePolicy, other: ImagePolicy) -> None:
 
 def test_it_learns_in_one_process() -> None:
     config = config_of(updates=40, num_envs=32, learning_rate=1e-2)
-    policy = toy.make_policy(config)
-    learner = make_reinforce(policy, config)
-    environment = toy.ReachToy(32, seed=0)
     rewards = [
         float(rollout.rewards_TN[rollout.valid_TN].mean())
-        for rollout, _ in train_policy(policy, environment, RuleReward(), config, learner=learner)
+        for rollout, _ in train_policy(toy.make_policy(config), toy.ReachToy(32, seed=0), RuleReward(), config)
     ]
     assert sum(rewards[-5:]) > 1.5 * sum(rewards[:5])
 
 
 def test_a_run_that_is_resumed_from_its_checkpoint_gives_the_weights_of_one_that_was_not(tmp_path: Path) -> None:
     config, straight, first, resumed = config_of(updates=3), *(toy.make_policy(config_of()) for _ in range(3))
-    for _ in train_policy(
-        straight, toy.ReachToy(4, seed=0), RuleReward(), config, learner=make_reinforce(straight, config)
-    ):
-        pass
+    assert len(list(train_policy(straight, toy.ReachToy(4, seed=0), RuleReward(), config))) == 3
     training = start(config, first, tmp_path)
     for _ in range(2):
         update(training, config)

@@ -86,7 +86,7 @@ def recorded() -> EpisodeArrays:
     names = get_task("push_cube").ground_truth_names
     success = rng.random((EPISODES, STEPS + 1, len(TASKS))) < 0.2
     success[:, 0], success[: EPISODES // 2, STEPS // 2] = False, True
-    demonstrators = [get_task(task).demonstrator for task in TASKS]
+    demonstrators = [get_task(task).model.demonstrator for task in TASKS]
     return EpisodeArrays(
         images, rng.uniform(0.45, 0.7, (EPISODES, STEPS + 1, 3)).astype(np.float32),
         rng.uniform(-1, 1, (EPISODES, STEPS, 3)).astype(np.float32),

@@ -9,7 +9,7 @@ import torch
 
 from wm_nodes.config.load import load_config
 from wm_nodes.core.device import DeviceError
-from wm_nodes.environments.maniskill import collection
+from wm_nodes.environments import collection
 from wm_nodes.environments.registry import configured_spec
 from wm_nodes.policy_rl import pretraining
 from wm_nodes.policy_rl.pretraining import _make_tokenizer_folder, make_model

@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from graph.foreign_arm import ForeignArm
 
+from examples import own_environment
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.tool_control import CommandedMove
 from wm_nodes.core.types import Episode
+from wm_nodes.environments.batch import EnvironmentBatch
 from wm_nodes.policy_rl.factories import make_imagined_environment, make_policy
 from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.policy_rl.pretraining import model_from_recordings
@@ -39,7 +40,7 @@ NO_STATE = {"state_names": (), "state_units": ()}
 
 def record(folder: Path, count: int = 12, **changes: Any) -> Path:
     """A bag of random episodes of the arm, of what `changes` of its spec leave of the state."""
-    arm = ForeignArm(1, 0)
+    arm = EnvironmentBatch(own_environment.SPEC, [own_environment.Arm()], 0)
     spec = replace(arm.spec, **changes)
     stream = numpy_stream(0, "random actions")
     with EpisodeBagWriter(folder, spec, run_id="lab", start_ns=1) as bag:
@@ -102,7 +103,7 @@ def test_a_policy_scales_measured_states_by_what_was_recorded(config: RunConfig,
 
 def mixed() -> EnvironmentSpec:
     """Three commanded values before a measured one."""
-    spec = ForeignArm(1, 0).spec
+    spec = own_environment.SPEC
     return replace(
         spec, action_names=spec.action_names[:3], action_units=("m",) * 3, action_scale=(0.1,) * 3,
         state_names=("target_x", "target_y", "target_z", "force"), state_units=("m", "m", "m", "N"),

@@ -122,11 +122,11 @@ def test_a_lost_reward_leaves_out_the_rollout_but_keeps_the_episodes(tmp_path: P
     assert not report.incomplete
 
 
-@pytest.mark.parametrize("start_ns", [0, 1_000 * m.NS_PER_S, 2_000 * m.NS_PER_S])
+@pytest.mark.parametrize("start_ns", [1_000 * m.NS_PER_S, 2_000 * m.NS_PER_S])
 def test_the_images_before_and_after_a_restart_are_not_mixed_whichever_stamps_are_later(
     tmp_path: Path, start_ns: int
 ) -> None:
-    graph = Graph(make_spec(num_envs=NUM_ENVS), start_ns=1_500 * m.NS_PER_S if start_ns else 0)
+    graph = Graph(make_spec(num_envs=NUM_ENVS), start_ns=1_500 * m.NS_PER_S)
     graph.rollout(1, 3)
     again = Graph(graph.spec, session=8, start_ns=start_ns)
     again.rollout(1, 9)
@@ -148,12 +148,12 @@ def test_images_that_do_not_fit_the_recorded_spec_are_refused(tmp_path: Path, gr
     for topic, message, _ in graph.published:
         if topic is topics.IMAGES:
             message.encoding = "bgr8"
-    with pytest.raises(BagError, match=r"encoding 'bgr8' instead of 'rgb8'.*another camera"):
+    with pytest.raises(BagError, match=r"encoding is 'bgr8', not 'rgb8'.*another robot, camera"):
         list(read_episodes(write(tmp_path / "bag", graph)))
     other = Graph(replace(graph.spec, width=20))
     other.rollout(1, 3)
     other.published[0] = (topics.SPEC, m.spec_message(graph.spec, 0, 7), 1)
-    with pytest.raises(BagError, match="width 40 instead of 24, step 120 instead of 72"):
+    with pytest.raises(BagError, match="width is 40, not 24; step is 120, not 72"):
         list(read_episodes(write(tmp_path / "other", other)))
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from deadlines import within
 from mcap.reader import make_reader
 from recording_samples import make_episode, make_spec
 
@@ -71,7 +72,7 @@ def test_a_gap_in_which_the_clock_was_set_is_said_and_not_waited_for(tmp_path: P
     began = time.monotonic()
     published, said = played(Playback(path, names=names))
     assert [data for _, data in published] == [text(number) for number in range(3)]
-    assert 0.1 <= time.monotonic() - began < 5
+    assert 0.1 <= time.monotonic() - began < within(5)
     assert said == ["the bag's time goes on by 1750000000 s here, which is not waited for"]
 
 
@@ -98,7 +99,7 @@ def test_a_recording_whose_clock_was_set_back_is_played_in_the_order_it_was_made
     published, said = played(Playback(tmp_path / "bag", rate=10.0))
     assert published == [(name, data) for name, _, data in messages]
     assert len(said) == 1 and "goes back by 3600 s" in said[0]
-    assert time.monotonic() - began < 10
+    assert time.monotonic() - began < within(10)
     assert played(Playback(tmp_path / "bag", rate=1e6, start_offset_s=1.0))[0] == published
 
 

@@ -8,12 +8,13 @@ pytest.importorskip("wm_msgs.msg", reason="wm_msgs is not built")
 from rclpy.clock import Clock
 
 from wm_msgs.msg import Credit
+from wm_nodes.core.lockstep import Goals, LockStep, Rewards
 from wm_nodes.core.processes import Activity
-from wm_nodes.nodes.learner.rollout_assembler import ImageCache, RolloutAssembler
+from wm_nodes.nodes.learner.rollout_assembler import RolloutAssembler
+from wm_nodes.recording.join import KEPT, Joiner
 from wm_nodes.ros.flow_control import SILENT_S, ConsumerCredits, ProducerCredits
 from wm_nodes.ros.liveliness import PeerWatch
 from wm_nodes.ros.sequence_numbers import GapTracker
-from wm_nodes.ros.wire import Rewards, Transition
 
 N = 2
 
@@ -164,19 +165,52 @@ def test_a_process_that_is_always_late_still_finds_out_who_is_lost() -> None:
     assert [now for now in range(0, 30, 2) if peers.check(now=float(now))] == [8]
 
 
-def test_the_image_cache_keeps_the_newest() -> None:
-    cache = ImageCache(2)
-    for stamp in (1, 2, 3):
-        cache.put(stamp, np.zeros((1, 1, 1, 3), np.uint8))
-    assert cache.get(1) is None
-    assert cache.get(3) is not None
-    cache.drop_before(3)
-    assert len(cache) == 1
+def test_of_what_no_lockstep_waits_for_only_the_newest_is_kept() -> None:
+    joiner = Joiner(with_rewards=True)
+    for step_id in range(KEPT + 2):
+        joiner.put_image(10 * step_id, images(1))
+        joiner.put_rewards(rewards(step_id))
+    assert (len(joiner._images), len(joiner._rewards)) == (KEPT, KEPT)
+    joiner.put_step(step(KEPT))
+    assert [joined.step_id for joined in joiner.take()] == [KEPT]
+    assert list(joiner._images) == [10 * KEPT, 10 * (KEPT + 1)]
 
 
-def step(step_id: int, *, version: int = 3, valid: bool = True, session: int = 1) -> Transition:
+def test_locksteps_leave_in_order_when_they_are_complete_or_too_late() -> None:
+    joiner = Joiner(with_rewards=True)
+    for step_id in (1, 2, 3):
+        joiner.put_step(step(step_id))
+        joiner.put_rewards(rewards(step_id))
+    assert list(joiner.take(patience_s=60)) == []
+    for step_id in (1, 3, 4):
+        joiner.put_image(10 * step_id, images(step_id))
+    assert [joined.step_id for joined in joiner.take(max_behind=2)] == [1]
+    assert [(joined.step_id, joined.images is None) for joined in joiner.take(max_behind=1)] == [(2, True), (3, False)]
+
+
+def test_goals_are_waited_for_until_it_is_clear_that_nobody_publishes_them() -> None:
+    joiner = Joiner(with_goals=True)
+    for step_id in (1, 2, 3):
+        joiner.put_image(10 * step_id, images(step_id))
+    joiner.put_step(step(1))
+    assert list(joiner.take(patience_s=60)) == []
+    assert [joined.goals for joined in joiner.take(patience_s=0)] == [None]
+    joiner.put_step(step(2))
+    assert len(list(joiner.take(patience_s=60))) == 1
+    joiner.clear()
+    joiner.put_step(step(1))
+    for stamp in (10, 20):
+        joiner.put_image(stamp, images(1))
+    joiner.put_goals(Goals(10, images(9), np.array([True, False]), np.zeros(N, np.uint64), session=2))
+    assert list(joiner.take(patience_s=60)) == [], "of another session"
+    joiner.put_goals(Goals(10, images(9), np.array([True, True]), np.zeros(N, np.uint64), session=1))
+    (joined,) = joiner.take(patience_s=60)
+    assert joined.goals is not None and (joined.goals[0] == 9).all() and joined.goals[1].all()
+
+
+def step(step_id: int, *, version: int = 3, valid: bool = True, session: int = 1) -> LockStep:
     zeros, flags = np.zeros(N, np.float32), np.zeros(N, bool)
-    return Transition(
+    return LockStep(
         stamp_ns=10 * step_id, next_stamp_ns=10 * (step_id + 1), step_id=step_id, actions=np.zeros((N, 3), np.float32),
         states=np.full((N, 3), step_id, np.float32), next_states=np.full((N, 3), step_id + 1, np.float32),
         logprobs=zeros, values=zeros, terminated=flags, truncated=flags, valid=np.full(N, valid),
@@ -187,7 +221,12 @@ def step(step_id: int, *, version: int = 3, valid: bool = True, session: int = 1
 
 
 def rewards(step_id: int, valid: bool = True) -> Rewards:
-    return Rewards(1, step_id, np.full(N, step_id, np.float32), np.array([valid, True]), np.zeros(N, np.uint8), "")
+    total = np.full(N, step_id, np.float32)
+    return Rewards(
+        session=1, step_id=step_id, stamp_ns=10 * step_id, total=total, dense=total, sparse=total,
+        components=total[:, None], component_names=("total",), success=np.zeros(N, np.uint8),
+        valid=np.array([valid, True]), invalid_reason="", name="rule", version=1,
+    )
 
 
 def images(value: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
@@ -232,8 +271,9 @@ def test_what_is_missing_is_invalid_and_counted_never_zero(left_out: tuple[str, 
 
 
 def test_invalid_rewards_and_other_versions_are_left_out_by_reason() -> None:
-    assembler = full_assembler()
+    assembler = full_assembler(("reward", 2))
     assembler.put_rewards(rewards(2, valid=False))
+    assembler.put_rewards(rewards(2))  # the first ones count
     assembler.put_transition(step(3, version=2))
     rollout, dropped = assembler.take(1, 3, policy_version=3)
     assert rollout.valid_TN.tolist() == [[True, True], [False, True], [False, False]]

@@ -10,9 +10,9 @@ from std_srvs.srv import Trigger
 
 from wm_msgs.msg import ErrorCode, NodeLinks
 from wm_msgs.srv import StepBatch
+from wm_nodes.core.errors import WireError
 from wm_nodes.ros import guard as guard_module
 from wm_nodes.ros.guard import Guard
-from wm_nodes.ros.wire import WireError
 
 
 class CountingNode:

@@ -17,20 +17,23 @@ from sensor_msgs.msg import Image
 from wm_msgs.msg import ActionBatch, Credit, EnvSpec, ErrorCode, PolicyVersion, RewardBatch, TaskGoal, TransitionBatch
 from wm_msgs.srv import ResetBatch, StepBatch
 from wm_nodes.config.load import load_config
+from wm_nodes.core.errors import WireError
+from wm_nodes.core.lockstep import Goals, LockStep
 from wm_nodes.nodes.policy.weights import PolicyHolder
 from wm_nodes.nodes.reward import summary
+from wm_nodes.recording.messages import goals_of, images_of, time_ns
 from wm_nodes.reward import RewardResult
 from wm_nodes.ros import calls, convert, flow_control
 from wm_nodes.ros.flow_control import ProducerCredits
 from wm_nodes.ros.sequence_numbers import check_session, new_session
-from wm_nodes.ros.wire import Goals, Reply, ResetCommand, StepCommand, Transition, WireError
+from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand
 
 N = 4
 TOY = ReachToy(N, seed=0)
 SPEC, OBSERVATION = TOY.spec, TOY.reset()
 ZEROS, ONES = np.zeros(N, np.float32), np.ones(N, bool)
-TRANSITION = Transition(
-    stamp_ns=1, next_stamp_ns=2, step_id=3, actions=np.zeros((N, 3), np.float32), states=OBSERVATION.state,
+TRANSITION = LockStep(
+    session=0, stamp_ns=1, next_stamp_ns=2, step_id=3, actions=np.zeros((N, 3), np.float32), states=OBSERVATION.state,
     next_states=OBSERVATION.state, logprobs=ZEROS, values=ZEROS, terminated=~ONES, truncated=~ONES, valid=ONES,
     episode_ids=OBSERVATION.episode_id, episode_steps=OBSERVATION.episode_step,
     policy_versions=np.zeros(N, np.uint64), success_probability=ZEROS, uncertainty=ZEROS,
@@ -42,11 +45,11 @@ SEEDS = np.zeros(N, np.uint64)
 
 READERS: dict[type[Any], tuple[Any, Callable[[Any], object]]] = {
     EnvSpec: (convert.spec_msg(SPEC, 5), convert.spec_from_msg),
-    Image: (convert.mosaic_msg(OBSERVATION.image, 1, SPEC), lambda m: convert.images_of(m, SPEC)),
+    Image: (convert.mosaic_msg(OBSERVATION.image, 1, SPEC), lambda m: images_of(m, SPEC)),
     TransitionBatch: (convert.transition_msg(TRANSITION), lambda m: convert.transition_of(m, SPEC)),
     TaskGoal: (
         convert.goal_msg(Goals(1, OBSERVATION.image, ONES, OBSERVATION.episode_id), SPEC),
-        lambda m: convert.goals_of(m, SPEC),
+        lambda m: goals_of(m, SPEC),
     ),
     RewardBatch: (convert.reward_msg(TRANSITION, REWARDS, name="rule", version=1, eval_s=0.1), convert.rewards_of),
     ActionBatch: (ActionBatch(num_envs=N, action=[0.0] * 3 * N), lambda m: convert.action_of(m, SPEC)),
@@ -58,10 +61,10 @@ READERS: dict[type[Any], tuple[Any, Callable[[Any], object]]] = {
         calls.reset_request(ResetCommand(ONES, SEEDS)), lambda m: calls.reset_command(m, SPEC)
     ),
     StepBatch.Response: (
-        calls.fill_step_response(StepBatch.Response(), REPLY, SPEC), lambda m: calls.step_reply(m, SPEC, 1)
+        calls.fill_response(StepBatch.Response(), REPLY, SPEC), lambda m: calls.reply_of(m, SPEC, 1)
     ),
     ResetBatch.Response: (
-        calls.fill_reset_response(ResetBatch.Response(), REPLY, SPEC), lambda m: calls.reset_reply(m, SPEC)
+        calls.fill_response(ResetBatch.Response(), REPLY, SPEC), lambda m: calls.reply_of(m, SPEC)
     ),
 }
 
@@ -88,7 +91,7 @@ def test_a_reader_returns_or_refuses_by_one_wire_error_whatever_a_message_holds(
 @pytest.mark.parametrize("stamp", [Time(sec=-1), Time(nanosec=10**9), Time(sec=2**31 - 1, nanosec=2**32 - 1)])
 def test_a_stamp_that_no_clock_gives_is_refused(stamp: Time) -> None:
     with pytest.raises(WireError, match="is no time") as refused:
-        convert.time_ns(stamp)
+        time_ns(stamp)
     assert refused.value.code == ErrorCode.OUT_OF_RANGE
 
 
@@ -107,13 +110,14 @@ def test_a_reward_or_a_transition_that_is_no_number_is_refused_where_it_says_tha
     assert convert.transition_of(step, SPEC).valid.tolist() == [False, True, True, True]
 
 
-def test_simulator_truth_of_another_size_is_refused_and_none_is_none() -> None:
+def test_simulator_truth_of_another_size_is_refused_and_none_is_unknown() -> None:
     step = convert.transition_msg(TRANSITION)
     step.ground_truth = [0.0] * (3 * N)
     with pytest.raises(WireError, match="ground_truth has 12 values"):
         convert.transition_of(step, SPEC)
     step.ground_truth = []
-    assert convert.transition_of(step, SPEC).ground_truth.shape == (N, 0)
+    truth = convert.transition_of(step, SPEC).ground_truth
+    assert truth.shape == (N, SPEC.ground_truth_dim) and np.isnan(truth).all()
 
 
 def test_a_session_is_the_announced_one_or_a_later_start() -> None:
@@ -143,7 +147,7 @@ def test_episodes_that_never_end_take_no_memory(monkeypatch: pytest.MonkeyPatch)
     assert len(window._returns) == 2 * N
 
 
-def _renamed(ids: Any) -> Transition:
+def _renamed(ids: Any) -> LockStep:
     return replace(TRANSITION, episode_ids=ids)
 
 

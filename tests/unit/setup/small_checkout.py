@@ -106,7 +106,7 @@ class SmallCheckout:
     def complete(self) -> str:
         """Set up without interruption; return what the set-up says. It ends by importing four packages."""
         child = self.start()
-        out, err = child.communicate(timeout=120)
+        out, err = child.communicate()
         assert child.returncode == 0 and "wm_nodes 1 on Python" in out, (out, err, self.log.read_text("utf-8")[-3000:])
         assert f"{self.venv}/lib" in out and f"{self.root}/ros2_ws/install" in out
         assert self.tf2_msgs().is_file()
@@ -135,7 +135,7 @@ class SmallCheckout:
             for pid in processes:
                 with suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
-        _, err = child.communicate(timeout=60)
+        _, err = child.communicate()
         return child.returncode, err
 
     def _runs(self, word: str, before: int) -> bool:

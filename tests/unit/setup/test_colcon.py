@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from wm_nodes.config.shipped import PRETRAINED
 
 SHOWN = """
@@ -21,6 +23,7 @@ print(json.dumps([str(Path(wm_nodes.__file__).parent), files]))
 """
 
 
+@pytest.mark.slow
 def test_the_packages_build_and_what_is_installed_is_whole(repository: Path, tmp_path: Path) -> None:
     """Without symbolic links, so that nothing of the checkout is used afterwards."""
     install = tmp_path / "install"

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from deadlines import PATIENCE_S
 from unit.setup.small_checkout import SmallCheckout
 
 from setup import console, stamp
@@ -36,7 +37,7 @@ def test_ten_interruptions_and_a_full_disk_leave_what_the_next_start_repairs(
 ) -> None:
     checkout, draw = SmallCheckout(tmp_path, repository), random.Random(seed)
     full = checkout.start(limit=100_000)
-    _, err = full.communicate(timeout=60)
+    _, err = full.communicate()
     assert full.returncode == 1 and "creating the virtual environment failed" in err
     said = ""
     for word in sorted(["-m venv", *draw.choices(list(COMMANDS), k=9)], key=list(COMMANDS).index):
@@ -88,6 +89,7 @@ def test_torn_packages_and_a_torn_build_are_made_again_in_an_environment_whose_o
     assert (checkout.venv / "mine.txt").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_lost_tf2_msgs_is_built_again_and_one_that_the_environment_has_is_left_alone(
     tmp_path: Path, repository: Path
 ) -> None:
@@ -112,7 +114,7 @@ def test_commands_of_a_killed_set_up_keep_its_lock_until_they_end(tmp_path: Path
     checkout = SmallCheckout(tmp_path, repository)
     checkout.interrupt("-m venv", 0.2, "KILL")
     assert checkout.locked()
-    until = time.monotonic() + 60
+    until = time.monotonic() + PATIENCE_S
     while checkout.processes() or checkout.locked():  # a process that ends has no environment before it has no files
         assert time.monotonic() < until, checkout.processes()
         time.sleep(0.05)
@@ -123,7 +125,7 @@ def test_a_folder_that_is_no_environment_is_refused_and_left_alone(tmp_path: Pat
     checkout.venv.mkdir()
     (checkout.venv / "thesis.txt").write_text("mine")
     refused = checkout.start()
-    _, err = refused.communicate(timeout=30)
+    _, err = refused.communicate()
     assert refused.returncode == 1 and err.splitlines()[-1].startswith(f"error: {checkout.venv} is not empty")
     assert os.listdir(checkout.venv) == ["thesis.txt"]
 

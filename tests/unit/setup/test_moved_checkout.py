@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import pytest
 from unit.setup.small_checkout import SmallCheckout
 
 SAID = "this checkout or its environment was in another folder"
@@ -29,6 +30,7 @@ def output(*command: object) -> str:
     return subprocess.run([*map(str, command)], capture_output=True, encoding="utf-8", check=True).stdout
 
 
+@pytest.mark.slow
 def test_a_checkout_is_moved_and_copied_and_nothing_of_the_old_folder_is_used(
     tmp_path: Path, repository: Path
 ) -> None:
@@ -55,6 +57,7 @@ def test_a_checkout_is_moved_and_copied_and_nothing_of_the_old_folder_is_used(
         assert checkout.complete() == ""
 
 
+@pytest.mark.slow
 def test_messages_are_built_in_a_folder_with_an_umlaut_and_again_where_they_changed_after_a_move(
     tmp_path: Path, repository: Path
 ) -> None:
@@ -67,6 +70,7 @@ def test_messages_are_built_in_a_folder_with_an_umlaut_and_again_where_they_chan
     assert SAID in said and "setting up messages;" in said and "building wm_msgs" in said
 
 
+@pytest.mark.slow
 def test_an_environment_elsewhere_follows_the_checkout_that_used_it_last(tmp_path: Path, repository: Path) -> None:
     checkout = SmallCheckout(tmp_path, repository)
     checkout.complete()

@@ -24,15 +24,14 @@ pytest.importorskip("peft")
 
 from pretended_device import Device  # noqa: E402
 from safetensors.torch import load_file  # noqa: E402
-from video_toys import grpo_config, kl_config  # noqa: E402
+from video_toys import grpo_config, kl_config, rollout_config, sampler_config  # noqa: E402
 
 from wm_nodes.apps.cli import main  # noqa: E402
+from wm_nodes.config.video import RolloutConfig  # noqa: E402
 from wm_nodes.core.model_folder import ModelFolderError  # noqa: E402
 from wm_nodes.video_model import (  # noqa: E402
     Condition,
     RolloutBuffer,
-    RolloutSettings,
-    SamplerSettings,
     StepContext,
     config_hash,
     guided_velocity,
@@ -198,9 +197,9 @@ PIXELS = {"height": 8 * SIDE, "width": 8 * SIDE, "num_frames": 1 + 4 * (FRAMES -
 CALL: dict[str, Any] = {**PIXELS, "output_type": "latent", "return_dict": False}
 
 
-def given(frames: Tensor | None = None, text: Tensor = TEXT, action_dim: int = 0) -> Condition:
+def given(frames: Tensor | None = None, text: Tensor = TEXT) -> Condition:
     frames = NOISE.new_zeros(1, C, 0, SIDE, SIDE) if frames is None else frames
-    return Condition(frames, NOISE.new_zeros(1, FRAMES - 1, action_dim), text)
+    return Condition(frames, NOISE.new_zeros(1, FRAMES - 1, 0), text)
 
 
 def picture(value: int = 0) -> Tensor:
@@ -221,7 +220,7 @@ def follow(model: PublicVelocity, times: Tensor, condition: Condition, cfg: floa
         for t, s in zip(times.double()[:-1], times.double()[1:]):
             v = guided_velocity(model, x, t.expand(1), condition, cfg)
             x = with_conditioning(
-                ode_step(x, v, t.expand(1), s.expand(1), context, SamplerSettings()).mean, condition.frames
+                ode_step(x, v, t.expand(1), s.expand(1), context, sampler_config()).mean, condition.frames
             )
     return x
 
@@ -247,7 +246,7 @@ class TestParityWithThePipelines:
             out = transformer(NOISE, told, TEXT, return_dict=False)[0]
             theirs = scheduler.step(out, scheduler.timesteps[2], NOISE, return_dict=False)[0]
             v = WanVelocity(transformer)(NOISE, t.expand(1), given())
-        ours = ode_step(NOISE, v, t.expand(1), s.expand(1), StepContext(given().frames, 0.9), SamplerSettings()).mean
+        ours = ode_step(NOISE, v, t.expand(1), s.expand(1), StepContext(given().frames, 0.9), sampler_config()).mean
         assert_close(ours, theirs, atol=1e-5, rtol=1e-5)
 
     def test_wan_fused_first_frame(self) -> None:
@@ -420,7 +419,7 @@ class TestText:
 
 
 def rollout_of(
-    model: PublicVelocity, condition: Condition, settings: RolloutSettings, version: int, iteration: int
+    model: PublicVelocity, condition: Condition, settings: RolloutConfig, version: int, iteration: int
 ) -> RolloutBuffer:
     """Two groups of two videos, rewarded by their mean brightness."""
     N = 4
@@ -449,7 +448,7 @@ class TestTraining:
         model = adapters()[kind]
         if lora:
             add_lora(model, 2, 4)
-        settings = RolloutSettings(num_steps=4, shift=3.0, cfg=2.0, micro_batch=4)
+        settings = rollout_config(num_steps=4, shift=3.0, cfg=2.0, micro_batch=4)
         anchor: Any = "lora_off" if lora else "frozen"
         learner = GrpoLearner(
             model,
@@ -488,21 +487,18 @@ class TestTraining:
                     assert_close(mine.grad, other.grad)
 
     @pytest.mark.parametrize("kind", ["wan", "cosmos2.5"])
-    def test_bfloat16_weights_and_autocast_stay_near_float32(self, kind: str) -> None:
-        exact, half, cast = (adapters()[kind] for _ in range(3))
+    def test_bfloat16_weights_stay_near_float32(self, kind: str) -> None:
+        exact, half = (adapters()[kind] for _ in range(2))
         half.transformer.to(torch.bfloat16)
-        cast.autocast = torch.bfloat16
         add_lora(half, 2)
         assert {p.dtype for name, p in half.named_parameters() if "lora_" in name} == {torch.float32}
         condition, t = given(normal(1, C, 1, SIDE, SIDE)), torch.tensor([0.6])
         wanted = exact(NOISE, t, condition)
-        for model in (half, cast):
-            found = model(NOISE, t, condition)
-            assert found.dtype == torch.float32
-            assert not torch.equal(found, wanted)
-            assert float(((found - wanted).norm() / wanted.norm()).detach()) < 0.05
-        found = half(NOISE, t, condition).square().sum()
-        found.backward()
+        found = half(NOISE, t, condition)
+        assert found.dtype == torch.float32
+        assert not torch.equal(found, wanted)
+        assert float(((found - wanted).norm() / wanted.norm()).detach()) < 0.05
+        found.square().sum().backward()
         assert all(p.grad is not None for p in half.parameters() if p.requires_grad)
 
 
@@ -539,29 +535,6 @@ class TestLora:
         add_lora(model, 1)
         with pytest.raises(ValueError, match="already"):
             add_lora(model, 1)
-        with pytest.raises(ValueError, match="save_lora"):
-            model.save(tmp_path)
-
-
-class TestActions:
-    @pytest.mark.parametrize("kind", ["wan", "cosmos2.5"])
-    def test_projection_starts_as_no_change_and_then_steers(self, kind: str) -> None:
-        plain = adapters()[kind]
-        model: PublicVelocity = (
-            WanVelocity(plain.transformer, NULL[0], frames="fused", action_dim=2)
-            if kind == "wan"
-            else CosmosVelocity(plain.transformer, NULL[0], action_dim=2)
-        )
-        condition, t = given(normal(1, C, 1, SIDE, SIDE)), torch.tensor([0.6])
-        acted = Condition(condition.frames, normal(1, FRAMES - 1, 2), condition.text)
-        assert torch.equal(model(NOISE, t, acted), plain(NOISE, t, condition))
-        assert model.actions is not None
-        nn.init.normal_(model.actions.weight)
-        drop = torch.tensor([True])
-        assert not torch.equal(model(NOISE, t, acted), plain(NOISE, t, condition))
-        assert torch.equal(model(NOISE, t, acted, drop), plain(NOISE, t, condition, drop))
-        with pytest.raises(ValueError, match="actions of 2 values"):
-            model(NOISE, t, condition)
 
 
 class TestCodec:
@@ -642,21 +615,20 @@ class TestFolder:
         assert adapter and all(torch.equal(p, trained[name]) for name, p in adapter.items())
         assert any(float(p.detach().abs().max()) > 0 for p in adapter.values()), "it starts as zeros"
 
-    def test_bfloat16_checkpointing_and_no_text_encoder(self, folder: Path) -> None:
-        both = load_public_model(folder, LoadSettings(dtype="bfloat16", max_tokens=12))
-        assert both.text is not None and both.text.encode(["push"]).dtype == torch.bfloat16
-        assert both.codec.vae.dtype == torch.float32, "the VAE keeps its own"
-        settings = LoadSettings(dtype="bfloat16", text=False, gradient_checkpointing=True, action_dim=3, tiling=True)
-        loaded = load_public_model(folder, settings, null_text=NULL[0])
-        assert loaded.text is None
+    def test_bfloat16_and_checkpointing(self, folder: Path) -> None:
+        settings = LoadSettings(dtype="bfloat16", gradient_checkpointing=True, max_tokens=12)
+        loaded = load_public_model(folder, settings)
+        assert loaded.text.encode(["push"]).dtype == torch.bfloat16
+        assert loaded.codec.vae.dtype == torch.float32, "the VAE keeps its own"
         assert loaded.velocity.transformer.patch_embedding.weight.dtype == torch.bfloat16
         frames = loaded.codec.encode(picture())
-        out = loaded.velocity(NOISE, torch.tensor([0.5]), given(frames, action_dim=3), torch.tensor([True]))
+        text = loaded.text.encode(["push"])
+        out = loaded.velocity(NOISE, torch.tensor([0.5]), given(frames, text), torch.tensor([True]))
         assert bool(out.isfinite().all())
         out.square().sum().backward()
 
     @pytest.mark.parametrize("version", ["2", "2.5"])
-    def test_cosmos_folder_and_what_save_writes(self, version: str, tmp_path: Path) -> None:
+    def test_a_cosmos_folder_loads(self, version: str, tmp_path: Path) -> None:
         pipeline = (cosmos2_pipeline if version == "2" else cosmos25_pipeline)(
             transformer=cosmos_transformer(concat_padding_mask=True, text_embed_dim=E if version == "2" else 32)
         )
@@ -664,13 +636,8 @@ class TestFolder:
         pipeline.save_pretrained(tmp_path, safe_serialization=True)
         loaded = load_public_model(tmp_path, LoadSettings(max_tokens=12))
         assert isinstance(loaded.velocity, CosmosVelocity) and loaded.velocity.version == version
-        assert loaded.text is not None
         condition, t = given(loaded.codec.encode(picture()), loaded.text.encode(["push"])), torch.tensor([0.5])
-        out = guided_velocity(loaded.velocity, NOISE, t, condition, 2.0)
-        loaded.velocity.save(tmp_path)
-        assert json.loads((tmp_path / "transformer" / "config.json").read_text())["concat_padding_mask"] is True
-        again = load_public_model(tmp_path, LoadSettings(max_tokens=12))
-        assert torch.equal(guided_velocity(again.velocity, NOISE, t, condition, 2.0), out)
+        assert bool(guided_velocity(loaded.velocity, NOISE, t, condition, 2.0).isfinite().all())
 
     def test_incomplete_folders_are_named_with_a_remedy(self, folder: Path, tmp_path: Path) -> None:
         def refused(match: str, path: Path) -> None:
@@ -744,24 +711,6 @@ class TestDevice:
                 assert_close(tensor, wanted[name], rtol=1e-4, atol=1e-6 if device.counts else 5e-3)
         assert files
 
-    def test_the_vae_takes_a_few_clips_at_a_time_and_the_text_encoder_may_live_elsewhere(
-        self, device: Device, tmp_path: Path
-    ) -> None:
-        wan_image_pipeline().save_pretrained(tmp_path, safe_serialization=True)
-        frames = torch.cat([picture(i).repeat(1, 5, 1, 1, 1) for i in range(5)])
-        whole = load_public_model(tmp_path, LoadSettings(max_tokens=12, vae_clips=8)).codec
-        settings = LoadSettings(max_tokens=12, vae_clips=2, device=device.name, text_device="cpu")
-        public, sizes = load_public_model(tmp_path, settings), list[int]()
-        public.codec.vae.encoder.register_forward_pre_hook(lambda _module, inputs: sizes.append(len(inputs[0])))
-        latents = public.codec.encode(frames)
-        assert set(sizes) == {1, 2} and latents.device.type == "cuda"
-        assert public.text is not None and public.text.encode(["push"]).device.type == "cpu"
-        condition = public.condition(frames[:2, :1], ["push", "left"], FRAMES)
-        assert condition.text.device.type == condition.frames.device.type == condition.actions.device.type == "cuda"
-        assert_close(latents.cpu(), whole.encode(frames), rtol=1e-4, atol=1e-5 if device.counts else 1e-2)
-        shown = public.codec.decode(latents).cpu().int() - whole.decode(latents.cpu()).int()
-        assert int(shown.abs().max()) <= (1 if device.counts else 3)
-
 
 class TestOptionalPackages:
     def test_video_model_and_adapters_import_none_of_them(self) -> None:
@@ -769,7 +718,7 @@ class TestOptionalPackages:
             "import sys, wm_nodes.video_model, wm_nodes.video_model.adapters\n"
             "assert not {'diffusers', 'transformers', 'peft', 'accelerate'} & set(sys.modules)"
         )
-        subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+        subprocess.run([sys.executable, "-c", code], check=True)
 
     def test_a_missing_one_is_named_with_the_pip_command(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         monkeypatch.setitem(sys.modules, "diffusers", None)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from video_toys import ACTION_DIM, randn, tiny_network
+from video_toys import ACTION_DIM, randn, rollout_config, tiny_network
 
 from wm_nodes.config.load import ConfigError, load_video_config
-from wm_nodes.video_model import Condition, RolloutSettings
+from wm_nodes.video_model import Condition
 from wm_nodes.video_model.continuation import ClipLengths, clip_condition, continue_videos
 from wm_nodes.video_rl.pretraining import change_std, cut_windows, shipped_video_model
 
@@ -39,7 +39,7 @@ def test_a_clip_goes_on_from_the_last_frames_under_the_actions_from_there() -> N
 def test_a_video_is_continued_to_its_length_and_depends_on_what_came_before() -> None:
     network, text = tiny_network(C), torch.zeros(N, 1, 0)
     first, actions = randn(N, C, 1, SIDE, SIDE), randn(N, 5, ACTION_DIM)
-    settings = RolloutSettings(num_steps=2)
+    settings = rollout_config(num_steps=2)
     whole = continue_videos(network, first, actions, text, LENGTHS, 6, noise, settings)
     assert whole.shape == (N, C, 6, SIDE, SIDE) and torch.equal(whole[:, :, :1], first)
     again = continue_videos(network, first, actions, text, LENGTHS, 6, noise, settings)

@@ -12,27 +12,27 @@ from torch.testing import assert_close
 from video_toys import (
     SHAPE,
     Analytic,
+    mask_config,
     randn,
+    sampler_config,
     swirl,
     times,
+    times_of,
     tiny_network,
     toy_buffer,
     toy_condition,
     toy_rollout_settings,
 )
 
+from wm_nodes.config.video import RolloutConfig
 from wm_nodes.video_model import (
     Condition,
-    MaskSettings,
     RolloutBuffer,
     RolloutBufferError,
-    RolloutSettings,
-    SamplerSettings,
     StepContext,
     concatenate_buffers,
     config_hash,
     step,
-    step_noise,
     transition,
 )
 from wm_nodes.video_model.sampling import normalised_noise
@@ -61,12 +61,12 @@ def assert_same(first: RolloutBuffer, second: RolloutBuffer) -> None:
                 assert a == b, f.name
 
 
-def first_transition(buffer: RolloutBuffer, settings: RolloutSettings, position: int, model: object):  # type: ignore[no-untyped-def]
+def first_transition(buffer: RolloutBuffer, settings: RolloutConfig, position: int, model: object):  # type: ignore[no-untyped-def]
     """What `model` says about stored step `position` of every video."""
     k, count = buffer.rollout.steps[position], len(buffer)
     return transition(
         model, buffer.condition, buffer.rollout.state(k), buffer.rollout.state(k + 1),  # type: ignore[arg-type]
-        settings.times[k].expand(count), settings.times[k + 1].expand(count), buffer.rollout.mask[:, position],
+        times_of(settings)[k].expand(count), times_of(settings)[k + 1].expand(count), buffer.rollout.mask[:, position],
         settings, cfg=settings.cfg,
     )
 
@@ -75,29 +75,24 @@ def first_transition(buffer: RolloutBuffer, settings: RolloutSettings, position:
 
 
 @pytest.mark.parametrize("arm", ["cps", "dyndiff"])
-@pytest.mark.parametrize("store", ["zeta", "seed"])
-def test_the_stored_noise_or_its_seed_gives_the_mean_of_every_step_back(arm: str, store: str) -> None:
-    """The mean is x_s - sigma zeta; from the seed it holds for float32 states."""
-    settings, model = toy_rollout_settings(arm=arm, noise_store=store), Analytic(swirl)
+def test_the_stored_noise_gives_the_mean_of_every_step_back(arm: str) -> None:
+    """The mean is x_s - sigma zeta."""
+    settings, model = toy_rollout_settings(arm=arm), Analytic(swirl)
     buffer = toy_buffer(model, settings, groups=1, size=2, shape=WIDE)
     for position, k in enumerate(buffer.rollout.steps):
         x_t, x_s = buffer.rollout.state(k), buffer.rollout.state(k + 1)
-        t, s = settings.times[k].expand(2), settings.times[k + 1].expand(2)
-        context = StepContext(buffer.condition.frames, float(settings.times[1]), buffer.rollout.mask[:, position])
+        t, s = times_of(settings)[k].expand(2), times_of(settings)[k + 1].expand(2)
+        context = StepContext(buffer.condition.frames, float(times_of(settings)[1]), buffer.rollout.mask[:, position])
         law = step(x_t, model(x_t, t, buffer.condition).detach(), t, s, context, settings.sampler)
-        zeta = (
-            step_noise(WIDE, buffer.rollout.seeds, k)[:, :, 1:] if store == "seed" else buffer.rollout.zeta[:, position]
-        )  # type: ignore[index]
-        found = x_s[:, :, 1:] - law.std[:, :, 1:] * zeta
+        found = x_s[:, :, 1:] - law.std[:, :, 1:] * buffer.rollout.zeta[:, position]
         assert_close(found, law.mean[:, :, 1:], atol=5e-7 * float(x_s.abs().max().clamp_min(1)), rtol=0)
-        assert (buffer.rollout.zeta is None) == (store == "seed")
 
 
 @pytest.mark.parametrize("t", [0.9, 0.5, 0.2])
 def test_noise_kept_in_bfloat16_costs_a_kl_below_3e_6_and_a_mean_kept_so_more_than_ten_times_that(t: float) -> None:
     """The noise is that of a step whose end was rounded to bfloat16 first."""
     x, v, z = (randn(1, 8, 4, 16, 16, seed=seed) for seed in (2, 3, 1))
-    law = step(x, v, times(t), times(0.8 * t), StepContext(x[:, :, :0], 0.9), SamplerSettings())
+    law = step(x, v, times(t), times(0.8 * t), StepContext(x[:, :, :0], 0.9), sampler_config())
     zeta = normalised_noise((law.mean + law.std * z).bfloat16().float(), law, 0).flatten(1)
     assert float((zeta - z.flatten(1)).abs().max()) > 1e-4, "rounding the state has changed its noise"
     assert float(mean_kl(zeta, zeta.bfloat16().float())) < 3e-6
@@ -112,45 +107,23 @@ def test_a_rollout_keeps_its_noise_in_bfloat16_where_asked_and_nothing_else_of_i
         toy_buffer(model, toy_rollout_settings(storage_dtype="bfloat16", noise_store=store), groups=1, size=2)
         for store in ("zeta", "zeta_bfloat16")
     )
-    assert exact.rollout.zeta is not None and rounded.rollout.zeta is not None
     assert torch.equal(rounded.rollout.zeta, exact.rollout.zeta.bfloat16())
     assert 2 * rounded.rollout.zeta.nbytes == exact.rollout.zeta.nbytes
     assert torch.equal(rounded.rollout.states, exact.rollout.states)
     assert_same(RolloutBuffer.from_bytes(rounded.to_bytes()), rounded)
 
 
-def test_a_mask_and_seeds_take_less_than_a_tenth_of_a_mask_and_the_noise_at_16_channels() -> None:
-    """In bytes."""
-    small, large = (
-        toy_buffer(
-            Analytic(swirl), toy_rollout_settings(noise_store=store), groups=1, size=2, shape=(16, 3, 4, 4), given=0
-        )
-        for store in ("seed", "zeta")
-    )
-    assert large.rollout.zeta is not None
-    seeds, noise, mask = small.rollout.seeds.nbytes, large.rollout.zeta.nbytes, small.rollout.mask.nbytes
-    assert mask + seeds < 0.1 * (mask + noise)
-    assert large.num_bytes - small.num_bytes == noise
-
-
-def test_seeds_cannot_stand_for_noise_that_was_rounded_to_bfloat16() -> None:
-    with pytest.raises(ValueError, match="noise_store seed needs storage_dtype float32"):
-        toy_rollout_settings(noise_store="seed", storage_dtype="bfloat16")
-
-
 # bf16 storage
 
 
 @pytest.mark.parametrize("arm", ["cps", "dyndiff", "flow"])
-@pytest.mark.parametrize("mask_dtype", ["float32", "float16"])
-def test_what_is_stored_in_bfloat16_has_the_log_probability_it_had_at_rollout(arm: str, mask_dtype: str) -> None:
+def test_what_is_stored_in_bfloat16_has_the_log_probability_it_had_at_rollout(arm: str) -> None:
     """The state is rounded before its density is taken, so training sees the same numbers."""
-    settings = toy_rollout_settings(arm=arm, storage_dtype="bfloat16", mask_dtype=mask_dtype)
+    settings = toy_rollout_settings(arm=arm, storage_dtype="bfloat16")
     model = tiny_network()
     buffer = toy_buffer(model, settings)
     assert buffer.rollout.states.dtype == torch.bfloat16 and buffer.rollout.latents.dtype == torch.float32
     buffer = RolloutBuffer.from_bytes(buffer.to_bytes())
-    assert buffer.rollout.zeta is not None
     for position in range(len(buffer.rollout.steps)):
         with torch.no_grad():
             new = first_transition(buffer, settings, position, model)
@@ -187,15 +160,13 @@ def test_a_buffer_survives_its_bytes_bit_for_bit(storage: str, given: int) -> No
     assert list(again.rewards) == sorted(again.rewards), "in one order on every rank"
     assert again.valid.tolist() == [True] * 5 + [False] + [True] * 2
     assert (again.policy_version, again.iteration, again.rollout.steps) == (3, 2, (0, 1, 2, 3, 4))
-    assert torch.equal(again.rollout.times, settings.times), "readable without the settings of its run"
+    assert torch.equal(again.rollout.times, times_of(settings)), "readable without the settings of its run"
 
 
-@pytest.mark.parametrize("changes", [{"noise_store": "seed"}, {"arm": "ode"}, {"num_steps": 1}, {"arm": "cps"}])
-def test_a_buffer_of_seeds_or_without_any_step_survives_its_bytes(changes: dict[str, object]) -> None:
+@pytest.mark.parametrize("changes", [{"arm": "ode"}, {"num_steps": 1}, {"arm": "cps"}])
+def test_a_buffer_of_another_arm_or_without_any_step_survives_its_bytes(changes: dict[str, object]) -> None:
     buffer = toy_buffer(Analytic(swirl), toy_rollout_settings(**changes))
-    again = RolloutBuffer.from_bytes(buffer.to_bytes())
-    assert_same(buffer, again)
-    assert (again.rollout.zeta is None) == ("noise_store" in changes)
+    assert_same(buffer, RolloutBuffer.from_bytes(buffer.to_bytes()))
 
 
 def test_one_tensor_under_two_names_can_be_written() -> None:
@@ -235,9 +206,8 @@ def test_a_file_that_lacks_one_tensor_is_refused_by_its_name(name: str) -> None:
 
 
 CHANGES = [
-    {"num_steps": 7}, {"shift": 5.0}, {"cfg": 2.0}, {"eta": 0.5}, {"arm": "cps"}, {"sigma_map": "linear"},
-    {"mask_on": "var"}, {"mask_dtype": "float16"}, {"mask": MaskSettings(m_min=0.3)},
-    {"mask": MaskSettings(budget="rms")},
+    {"num_steps": 7}, {"shift": 5.0}, {"cfg": 2.0}, {"eta": 0.5}, {"arm": "cps"},
+    {"mask": mask_config(m_min=0.3)}, {"mask": mask_config(budget="rms")},
 ]
 
 
@@ -257,7 +227,6 @@ def test_how_a_rollout_is_batched_or_its_noise_is_kept_does_not_make_it_another_
     plain = config_hash(toy_rollout_settings())
     assert (
         config_hash(toy_rollout_settings(micro_batch=3))
-        == config_hash(toy_rollout_settings(noise_store="seed"))
         == config_hash(toy_rollout_settings(noise_store="zeta_bfloat16"))
         == config_hash(toy_rollout_settings(buffer_device="cpu"))
         == plain
@@ -301,14 +270,12 @@ def test_groups_sampled_in_parts_make_the_whole_buffer() -> None:
     second = replace(second, group_ids=second.group_ids + 1)
     whole = concatenate_buffers([first, second])
     assert len(whole) == 6 and whole.group_ids.tolist() == [0] * 4 + [1] * 2
-    assert whole.rollout.zeta is not None and whole.rollout.zeta.shape[0] == len(whole.rewards["brightness"]) == 6
+    assert whole.rollout.zeta.shape[0] == len(whole.rewards["brightness"]) == 6
     assert torch.equal(whole.rollout.latents[4:], second.rollout.latents) and whole.valid.tolist() == [True] * 6
     assert torch.equal(whole.condition.actions[4:], second.condition.actions)
     rms = (4 * first.rollout.noise_share.square() + 2 * second.rollout.noise_share.square()) / 6
     assert_close(whole.rollout.noise_share, rms.sqrt())
     whole.check(settings, 0, 0)
-    part = toy_buffer(model, toy_rollout_settings(noise_store="seed"), groups=1)
-    assert concatenate_buffers([part, replace(part, group_ids=part.group_ids + 1)]).rollout.zeta is None
 
 
 @pytest.mark.parametrize("changes", [{"policy_version": 9}, {"config_hash": "x" * 64}, {"iteration": 7}])
@@ -347,7 +314,6 @@ def test_a_transition_carries_gradient_in_its_noise_only() -> None:
 def test_odd_and_single_sizes_have_a_ratio_of_one_before_any_update(shape: tuple[int, int, int, int], arm: str) -> None:
     settings, model = toy_rollout_settings(arm=arm), tiny_network(shape[0])
     buffer = toy_buffer(model, settings, shape=shape, given=0)
-    assert buffer.rollout.zeta is not None
     new = first_transition(buffer, settings, 2, model)
     assert torch.equal(log_ratio(new.zeta, buffer.rollout.zeta[:, 2].flatten(1)), torch.zeros(8))
 

@@ -16,7 +16,7 @@ def window(
 
 
 def selected(num_steps: int = 11, num_samples: int = 3, **changes: object) -> Tensor:
-    options: dict[str, object] = {"fraction": 0.55, "select": "random", "min_s": 0.0, "seed": 0, "iteration": 0}
+    options: dict[str, object] = {"fraction": 0.55, "min_s": 0.0, "seed": 0, "iteration": 0}
     return select_steps(flow_times(num_steps), list(range(num_steps - 1)), num_samples, **{**options, **changes})  # type: ignore[arg-type]
 
 
@@ -32,7 +32,7 @@ def test_a_progressive_window_moves_on_by_one_each_period_and_rolls_back_to_its_
     assert window("progressive", 24) == [0, 1, 2, 3] and window("progressive", 25) == [1, 2, 3, 4]
 
 
-@pytest.mark.parametrize("strategy", ["progressive", "random", "decay", "exp_decay", "fast"])
+@pytest.mark.parametrize("strategy", ["progressive", "random", "fast"])
 def test_a_window_is_never_shorter_than_its_size_and_never_holds_the_last_step(strategy: str) -> None:
     """Mix-GRPO's own state machine gives lengths 4, 3, 2, 1, 0 near the end."""
     for num_steps in (6, 10, 25, 50):
@@ -41,7 +41,7 @@ def test_a_window_is_never_shorter_than_its_size_and_never_holds_the_last_step(s
             assert len(steps) == 4 and steps == list(range(steps[0], steps[0] + 4)) and steps[-1] < num_steps - 1
 
 
-@pytest.mark.parametrize("strategy", ["progressive", "random", "decay", "exp_decay", "fast"])
+@pytest.mark.parametrize("strategy", ["progressive", "random", "fast"])
 def test_a_window_as_long_as_all_stochastic_steps_is_all_of_them(strategy: str) -> None:
     assert window(strategy, 77, num_steps=5) == [0, 1, 2, 3]
     assert window(strategy, 77, num_steps=3) == [0, 1]
@@ -58,25 +58,6 @@ def test_a_random_window_reaches_every_start_and_is_the_same_for_the_same_seed()
 def test_the_fast_window_stays_in_the_first_half() -> None:
     found = {tuple(window("fast", i, size=2)) for i in range(200)}
     assert found == {(k, k + 1) for k in range(4)}
-
-
-def stays(strategy: str, *, num_steps: int, period: int) -> list[int]:
-    """Iterations at each start, 0 first, until the window is back at its start."""
-    starts = [window(strategy, i, num_steps=num_steps, period=period)[0] for i in range(2000)]
-    first = starts[: starts.index(0, period)]
-    assert first == sorted(first) and starts[len(first)] == 0
-    return [first.count(start) for start in range(num_steps - 4)]
-
-
-def test_an_exponentially_decaying_window_stays_shorter_from_step_13_on() -> None:
-    """25 steps, window of 4, period 20: 20 e^(-k / 10) iterations, rounded up, at the k-th start after the 13th."""
-    assert stays("exp_decay", num_steps=25, period=20) == [20] * 14 + [19, 17, 15, 14, 13, 11, 10]
-
-
-def test_a_decaying_window_stays_linearly_shorter_towards_a_quarter_of_its_period() -> None:
-    """12 steps, window of 4, period 20: 20 (1 - l / 10) + 5 l / 10 at start l, rounded down."""
-    assert stays("decay", num_steps=12, period=20) == [20, 18, 17, 15, 14, 12, 11, 9]
-    assert stays("decay", num_steps=6, period=1) == [1, 1]
 
 
 @pytest.mark.parametrize("bad", [{"size": 0}, {"period": 0}])
@@ -100,19 +81,12 @@ def test_a_fraction_trains_its_floor_of_the_stochastic_steps_of_each_video() -> 
     assert torch.equal(chosen[:7], selected(num_samples=7)), "more videos do not change the choice of the first"
 
 
-def test_the_first_steps_are_the_noisiest_and_tmin_is_a_limit_on_time() -> None:
-    assert selected(select="first")[0].tolist() == [True] * 5 + [False] * 5
-    chosen = selected(num_steps=10, select="tmin")[1]
-    assert chosen.tolist() == [t >= 0.55 for t in (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)]
-
-
-@pytest.mark.parametrize("select", ["random", "first", "tmin"])
 @pytest.mark.parametrize("fraction", [0.0, 0.01, 1.0])
-def test_at_least_one_step_always_trains(select: str, fraction: float) -> None:
+def test_at_least_one_step_always_trains(fraction: float) -> None:
     for num_steps in (2, 3, 50):
-        chosen = selected(num_steps, select=select, fraction=fraction)
+        chosen = selected(num_steps, fraction=fraction)
         assert bool(chosen.any(1).all())
-        if fraction == 1.0 and select != "tmin":
+        if fraction == 1.0:
             assert bool(chosen.all())
 
 
@@ -123,11 +97,11 @@ def test_steps_that_end_too_close_to_the_data_do_not_train() -> None:
 
 
 def test_a_selection_counts_positions_among_the_stochastic_steps() -> None:
-    chosen = select_steps(flow_times(10), [3, 4, 5, 6], 2, fraction=0.5, select="first", min_s=0.0, seed=0, iteration=0)
+    chosen = select_steps(flow_times(10), [3, 4, 5, 6], 2, fraction=1.0, min_s=0.45, seed=0, iteration=0)
     assert chosen.tolist() == [[True, True, False, False]] * 2
 
 
 @pytest.mark.parametrize(("steps", "min_s"), [([], 0.0), ([0, 1], 0.9)])
 def test_no_step_that_could_train_is_an_error_that_says_what_to_do(steps: list[int], min_s: float) -> None:
     with pytest.raises(ValueError, match=r"no step can train: .*take more sampler steps, or lower grpo.min_s"):
-        select_steps(times(1, 0.5, 0.2, 0), steps, 2, fraction=1.0, select="random", min_s=min_s, seed=0, iteration=0)
+        select_steps(times(1, 0.5, 0.2, 0), steps, 2, fraction=1.0, min_s=min_s, seed=0, iteration=0)

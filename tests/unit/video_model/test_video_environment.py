@@ -7,13 +7,14 @@ import pytest
 import torch
 from recording_samples import make_spec
 from torch import Tensor
+from video_toys import rollout_config
 
 from wm_nodes.config.load import load_config
 from wm_nodes.core.seeding import stream_seed
 from wm_nodes.core.specs import SOURCE_IMAGINED, EnvironmentSpec
 from wm_nodes.core.tool_control import next_state
 from wm_nodes.core.types import FloatArray, StepResult, UInt8Array
-from wm_nodes.video_model import NetworkSettings, RolloutSettings, VideoNetwork, initial_noise
+from wm_nodes.video_model import NetworkSettings, VideoNetwork, initial_noise
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.conditions import hashed_words
 from wm_nodes.video_model.continuation import ClipLengths, continue_videos
@@ -96,7 +97,7 @@ def test_an_episode_is_the_model_going_on_from_its_own_last_frames() -> None:
     latents = continue_videos(
         folder.network, folder.codec.encode(torch.from_numpy(first).unsqueeze(1)),
         torch.from_numpy(np.stack(acted, 1)), hashed_words(("push cube",), 4), ClipLengths(4, 1), count + 1, noise,
-        RolloutSettings(4, 3.0),
+        rollout_config(num_steps=4, shift=3.0),
     )
     expected = folder.codec.decode(latents)[0, 1:].numpy()
     assert np.abs(expected.astype(int) - np.stack(seen)).max() <= 1  # a batch of one rounds otherwise

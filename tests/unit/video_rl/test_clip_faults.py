@@ -7,32 +7,35 @@ from torch import Tensor
 
 from wm_nodes.config.load import load_config
 from wm_nodes.core.types import FloatArray
-from wm_nodes.video_rl.clip_faults import FaultLimits, _places, _still_cameras, find_faults, measure_fault_limits
-from wm_nodes.world_model.tokenizer import PROBE_NAMES
+from wm_nodes.video_rl.clip_faults import FaultLimits, find_faults, measure_fault_limits, seen_at
+from wm_nodes.video_rl.heldout_metrics import filmed_scene
+from wm_nodes.world_model.positions import position_names
 
 SIMULATION = load_config("smoke").simulation
+SCENE = filmed_scene("push_cube", SIMULATION, 64)
+NAMES = position_names("push_cube")
 LIMITS = FaultLimits(tool_step_m=0.15, object_px=6)
-OBJECT_X, TOOL_X, TOOL_Z = (PROBE_NAMES.index(name) for name in ("object_x", "tool_x", "tool_z"))
+OBJECT_X, TOOL_X, TOOL_Z = (NAMES.index(name) for name in ("object_x", "tool_x", "tool_z"))
 GREEN, TABLE = (20, 160, 40), (200, 190, 170)
 
 
 def still(frames: int = 5) -> FloatArray:
     """One clip in which nothing moves: the tool 20 cm beside the object and 10 cm above it."""
-    at = dict.fromkeys(PROBE_NAMES, 0.0) | {"tool_x": 0.2, "tool_z": 0.12, "goal_x": 0.2}
-    return np.tile(np.array([at[name] for name in PROBE_NAMES], np.float32), (1, frames, 1))
+    at = dict.fromkeys(NAMES, 0.0) | {"tool_x": 0.2, "tool_z": 0.12, "goal_x": 0.2}
+    return np.tile(np.array([at[name] for name in NAMES], np.float32), (1, frames, 1))
 
 
 def drawn(positions: FloatArray) -> Tensor:
     """Two views; the left one has a square of 6 x 6 px where the side camera sees the object."""
-    index, camera = _still_cameras(SIMULATION, 64)[0]
+    index, camera = SCENE.cameras[0]
     images = np.full((*positions.shape[:2], 64, 128, 3), TABLE, np.uint8)
-    for frame, (column, row) in enumerate(_places(positions[0], camera)[0].round().astype(int)):
+    for frame, (column, row) in enumerate(seen_at(positions[0], SCENE, camera)[0].round().astype(int)):
         images[0, frame, row - 3 : row + 3, 64 * index + column - 3 : 64 * index + column + 3] = GREEN
     return torch.from_numpy(images)
 
 
 def faults(positions: FloatArray, frames: Tensor | None = None) -> dict[str, float]:
-    found = find_faults(drawn(positions) if frames is None else frames, positions, LIMITS, SIMULATION, 1).named()
+    found = find_faults(drawn(positions) if frames is None else frames, positions, LIMITS, SCENE, 1).named()
     assert all(value.dtype == torch.float64 and value.shape == (1,) for value in found.values())
     return {name: float(value) for name, value in found.items()}
 
@@ -72,8 +75,8 @@ def test_scenery_is_what_the_still_camera_sees_away_from_tool_and_object() -> No
     positions, frames = still(), drawn(still())
     frames[0, 1:, :, 64:] = 0
     assert faults(positions, frames)["scenery_change"] == 0, "the camera on the hand moves"
-    _, camera = _still_cameras(SIMULATION, 64)[0]
-    column, row = _places(positions[0, 0], camera)[1].round().astype(int)
+    _, camera = SCENE.cameras[0]
+    column, row = seen_at(positions[0, 0], SCENE, camera)[1].round().astype(int)
     frames[0, 1:, row - 8, column] = 0
     assert faults(positions, frames)["scenery_change"] == 0, "the hand hides what is above the tool"
     frames[0, 1:, 60:, :64] = 0
@@ -84,14 +87,16 @@ def test_limits_are_quantiles_of_recordings() -> None:
     positions = np.tile(still(3), (200, 1, 1))
     positions[:, 2, TOOL_X] += np.linspace(0, 0.199, 200, dtype=np.float32)
     positions[:, 1, TOOL_X] = positions[:, 2, TOOL_X]
-    limits = measure_fault_limits(drawn(still(3)).expand(200, -1, -1, -1, -1), positions, SIMULATION)
+    limits = measure_fault_limits(drawn(still(3)).expand(200, -1, -1, -1, -1), positions, SCENE)
     assert limits.tool_step_m == pytest.approx(0.195, abs=2e-3) and limits.object_px == 36
 
 
-def test_no_given_frame_and_no_still_camera_are_refused() -> None:
+def test_no_given_frame_no_still_camera_and_another_size_are_refused() -> None:
     positions, frames = still(), drawn(still())
     with pytest.raises(ValueError, match="num_conditioning 0"):
-        find_faults(frames, positions, LIMITS, SIMULATION, 0)
+        find_faults(frames, positions, LIMITS, SCENE, 0)
     moving = SIMULATION.model_copy(update={"cameras": ["wrist"]})
     with pytest.raises(ValueError, match=r"wrist.*still one"):
-        find_faults(frames[:, :, :, 64:], positions, LIMITS, moving, 1)
+        filmed_scene("push_cube", moving, 64)
+    with pytest.raises(ValueError, match="clips are 32 px high"):
+        find_faults(frames[:, :, 32:], positions, LIMITS, SCENE, 1)

@@ -26,7 +26,7 @@ from video_toys import (
 )
 
 from wm_nodes.config.load import load_video_config
-from wm_nodes.config.video import GrpoConfig, RolloutConfig
+from wm_nodes.config.video import GrpoConfig
 from wm_nodes.reports.clip_report import clip_panels
 from wm_nodes.reports.curves import curves
 from wm_nodes.training.metrics import FILE_NAME, read_metrics
@@ -44,9 +44,9 @@ NO_KL, FROZEN = kl_config("none"), kl_config("velocity", 0.5, "frozen")
 ADVANTAGES = [1.5, -0.5, 0.25, -1.0, 2.5, -2.5, 0.0, 0.7]
 
 
-def nft_config(beta: float = 1.0, *, adaptive: bool = True, times: int = 3, **changes: Any) -> GrpoConfig:
+def nft_config(beta: float = 1.0, *, times: int = 3, **changes: Any) -> GrpoConfig:
     decay = {name: changes.pop(name) for name in ("old_decay", "old_ramp") if name in changes}
-    nft = grpo_config().nft.with_values(beta=beta, adaptive=adaptive, times=times, **decay)
+    nft = grpo_config().nft.with_values(beta=beta, times=times, **decay)
     return grpo_config(**{
         "objective": "nft", "nft": nft, "kl": NO_KL, "learning_rate": 1e-3, "micro_batch": 8, **changes
     })
@@ -100,11 +100,10 @@ def drawn(learner: GrpoLearner, buffer: RolloutBuffer, rows: Rows) -> tuple[np.n
 # the formula
 
 
-@pytest.mark.parametrize("adaptive", [True, False])
 @pytest.mark.parametrize("beta", [1.0, 0.1, 2.5])
-def test_loss_and_gradient_of_a_linear_velocity_are_those_worked_out_by_hand(beta: float, adaptive: bool) -> None:
+def test_loss_and_gradient_of_a_linear_velocity_are_those_worked_out_by_hand(beta: float) -> None:
     """v = a x + b now at a = 0.5, b = 0.1, old at a = 0.3, b = -0.2; c = 2.5."""
-    learner = make(Line(), beta=beta, adaptive=adaptive, micro_batch=5)
+    learner = make(Line(), beta=beta, micro_batch=5)
     buffer, rows = buffer_of(learner), all_rows(8)
     with torch.no_grad():
         learner.model.slope.fill_(0.5)
@@ -116,7 +115,7 @@ def test_loss_and_gradient_of_a_linear_velocity_are_those_worked_out_by_hand(bet
     for share, sign in ((r, 1), (1 - r, -1)):
         v = beta * new + (1 - beta) * old if sign == 1 else (1 + beta) * old - beta * new
         error = x_t - t * v - x_0
-        scale = np.maximum(np.abs(error).mean(axes), 1e-5) if adaptive else np.ones(24)
+        scale = np.maximum(np.abs(error).mean(axes), 1e-5)
         loss = loss + c * share * (error**2).mean(axes) / scale / beta
         down = -2 * sign * t * error * beta  # d error^2 / d v, by the chain rule through v+ or v-
         slope = slope + c * share * (down * x_t).mean(axes) / scale / beta
@@ -128,12 +127,9 @@ def test_loss_and_gradient_of_a_linear_velocity_are_those_worked_out_by_hand(bet
     assert float(learner.model.offset.grad) == pytest.approx(np.mean(offset), rel=1e-4)
 
 
-@pytest.mark.parametrize("adaptive", [True, False])
 @pytest.mark.parametrize("beta", [1.0, 0.1])
-def test_clips_without_an_advantage_have_no_gradient_while_the_weights_are_the_old_ones(
-    beta: float, adaptive: bool
-) -> None:
-    learner = make(beta=beta, adaptive=adaptive)
+def test_clips_without_an_advantage_have_no_gradient_while_the_weights_are_the_old_ones(beta: float) -> None:
+    learner = make(beta=beta)
     buffer = buffer_of(learner)
     assert not gradient(learner, buffer, [0.0] * 8).any()
     assert gradient(learner, buffer, ADVANTAGES).norm() > 0.1
@@ -143,9 +139,9 @@ def test_clips_without_an_advantage_have_no_gradient_while_the_weights_are_the_o
     assert gradient(learner, buffer, [0.0] * 8).any(), "then it draws back to them"
 
 
-def test_the_best_clips_with_beta_1_are_learned_by_plain_flow_matching_in_the_space_of_clean_clips() -> None:
+def test_the_best_clips_with_beta_1_are_learned_by_flow_matching_in_the_space_of_clean_clips() -> None:
     """A = c: r = 1, v+ = v; the error x^_0 - x_0 is t times that of the velocity."""
-    learner = make(adaptive=False)
+    learner = make()
     buffer, rows = buffer_of(learner), all_rows(8)
     found = gradient(learner, buffer, [2.5] * 8)
     _, noise = learner._terms._draw(buffer, rows, 0)
@@ -153,20 +149,18 @@ def test_the_best_clips_with_beta_1_are_learned_by_plain_flow_matching_in_the_sp
     condition = buffer.condition.rows(rows.videos)
     x_t = torch.cat([condition.frames, ((1 - t) * x_0 + t * noise)[:, :, 1:]], 2)
     error = (learner.model(x_t, t.flatten().double(), condition) - (noise - x_0))[:, :, 1:]
-    loss = 2.5 * (t * error).square().mean()
+    errors = (t * error).flatten(1)
+    loss = 2.5 * (errors.square().mean(1) / errors.detach().abs().mean(1)).mean()
     wanted = torch.autograd.grad(loss, learner.parameters, allow_unused=True)  # the text layer, without a text
     wanted = torch.cat([g.flatten() for g in wanted if g is not None])
     assert float((found - wanted).norm() / wanted.norm()) < 1e-5
 
 
 @pytest.mark.parametrize("good", [0, 1])
-@pytest.mark.parametrize("adaptive", [True, False])
-def test_a_step_moves_the_velocity_towards_that_of_the_good_clip_and_away_from_that_of_the_bad_one(
-    good: int, adaptive: bool
-) -> None:
+def test_a_step_moves_the_velocity_towards_that_of_the_good_clip_and_away_from_that_of_the_bad_one(good: int) -> None:
     """Clips of ones and of minus ones; v is a constant. The velocity eps - x_0 to the clip of ones is the lower one."""
     model = Analytic(lambda x, t: torch.zeros_like(x))
-    learner = GrpoLearner(model, nft_config(adaptive=adaptive), ODE, seed=0)
+    learner = GrpoLearner(model, nft_config(), ODE, seed=0)
     buffer = buffer_of(learner, groups=1, size=2)
     values = torch.tensor([1.0, -1.0]).view(2, 1, 1, 1, 1).expand_as(buffer.rollout.latents)
     buffer = replace(buffer, rollout=replace(buffer.rollout, latents=values.contiguous()))
@@ -214,7 +208,7 @@ def test_times_lie_one_in_each_part_of_the_sampler_s_range_and_every_update_draw
 # the learner's contracts
 
 
-@pytest.mark.parametrize("rollout", [ODE, toy_rollout_settings(micro_batch=8, arm="cps", noise_store="seed")])
+@pytest.mark.parametrize("rollout", [ODE, toy_rollout_settings(micro_batch=8, arm="cps")])
 def test_clips_of_any_sampler_train_and_what_does_not_exist_is_not_a_number(rollout: Any) -> None:
     learner = make(rollout=rollout)
     before = weights(learner.model)
@@ -229,11 +223,11 @@ def test_clips_of_any_sampler_train_and_what_does_not_exist_is_not_a_number(roll
 
 
 def test_every_update_trains_the_kept_videos_alone() -> None:
-    learner = make(passes="parts")
+    learner = make()
     buffer = buffer_of(learner)
     rewards = torch.tensor([0.0, 1, math.nan, 3, 5, 5, 5, 5])
     report = learner.train(buffer.with_rewards({"total": rewards}))
-    assert report.kept == 3 and [update.transitions for update in report.updates] == [3, 6]
+    assert report.kept == 3 and [update.transitions for update in report.updates] == [9, 9]
 
 
 @pytest.mark.parametrize("changes", [{}, {"kl": FROZEN}])
@@ -291,7 +285,7 @@ def test_the_old_weights_follow_after_each_buffer(decay: float, ramp: float, kep
         assert_close(learner._terms.old[name], kept * start[name] + (1 - kept) * value)
 
 
-STATEFUL = [{}, {"old_decay": 0.5, "old_ramp": 0.1}, {"kl": FROZEN, "ema_decay": 0.9, "passes": "parts"}]
+STATEFUL = [{}, {"old_decay": 0.5, "old_ramp": 0.1}, {"kl": FROZEN, "ema_decay": 0.9}]
 
 
 @pytest.mark.parametrize("changes", STATEFUL)
@@ -328,7 +322,7 @@ def test_a_gradient_that_is_not_finite_undoes_the_whole_buffer(changes: dict[str
         train_rounds(one, range(1))
     buffer, before, old = buffer_of(learner, iteration=7), weights(learner.model), copy.deepcopy(learner._terms.old)
     calls = iter(range(1000))
-    first = len(next(learner._passes(buffer, torch.ones(8).bool()))) // 8 + 1
+    first = len(learner.rows(buffer, torch.ones(8).bool())) // 8 + 1
     handle = learner.parameters[0].register_hook(lambda g: g * (math.nan if next(calls) >= first else 1.0))
     with pytest.raises(FloatingPointError, match="gradient is not finite"):
         learner.train(buffer)
@@ -361,23 +355,20 @@ def test_the_kl_is_the_squared_distance_of_the_velocities_from_the_anchor_s() ->
     assert float(found) == pytest.approx(2.0 * 2 * 0.5, rel=1e-5), "beta d v^2 / d v"
 
 
-@pytest.mark.parametrize("anchor", ["frozen", "moving"])
-def test_each_anchor_is_where_it_says(anchor: str) -> None:
-    learner, found = make(kl=kl_config("velocity", 0.5, anchor, 3)), []
+def test_a_frozen_anchor_is_where_training_began() -> None:
+    learner, found = make(kl=FROZEN), []
     for iteration in range(3):
         found += [update.kl for update in learner.train(buffer_of(learner, iteration=iteration)).updates]
-    assert [kl == 0.0 for kl in found] == [True, False, False, anchor == "moving", False, False]
+    assert [kl == 0.0 for kl in found] == [True] + [False] * 5
 
 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
         ({"kl": kl_config("mean", 0.5, "frozen")}, "no transitions, got kl.mode mean with kl.anchor frozen; take"),
-        ({"kl": kl_config("logk3", 0.5, "frozen")}, "got kl.mode logk3"),
+        ({"kl": kl_config("logk2", 0.5, "frozen")}, "got kl.mode logk2"),
         ({"kl": kl_config("velocity", 0.5, "buffer")}, "got kl.mode velocity with kl.anchor buffer"),
-        ({"kl": kl_config("velocity", 0.5, "dual")}, "with kl.anchor dual; .* frozen, moving or lora_off"),
-        ({"equalise": True, "ratio_norm": True}, "has no ratio, got ratio_norm, equalise; switch it off"),
-        ({"mask_source": "recompute"}, "got mask_source recompute"),
+        ({"kl": kl_config("velocity", 0.5, "dual")}, "with kl.anchor dual; .* frozen or lora_off"),
     ],
 )
 def test_what_needs_a_transition_is_refused(changes: dict[str, Any], said: str) -> None:
@@ -395,9 +386,7 @@ def test_the_ratio_still_needs_a_sampler_with_noise_and_names_this_objective() -
 
 def test_a_run_folder_of_ode_clips_resumes_and_writes_null_for_what_does_not_exist(tmp_path: Path) -> None:
     plain = load_video_config("smoke")
-    config = plain.with_values(
-        rollout=RolloutConfig.model_validate(ODE, from_attributes=True), grpo=nft_config(old_decay=0.3, old_ramp=1.0)
-    )
+    config = plain.with_values(rollout=ODE, grpo=nft_config(old_decay=0.3, old_ramp=1.0))
 
     def train(run: VideoRun, rounds: int) -> VideoRun:
         for _ in range(rounds):

@@ -46,6 +46,7 @@ def test_commanded_states_are_those_recorded_where_the_actions_are() -> None:
     np.testing.assert_allclose(follow(episodes.states[:, 0], episodes.actions, SPEC), episodes.states, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_model_that_obeys_is_worse_on_another_episodes_actions_and_follows_them(models: WorldModels) -> None:
     episodes = arrays(24, 10_000)
     metrics = controllability_metrics(models, episodes, SPEC)
@@ -54,6 +55,7 @@ def test_a_model_that_obeys_is_worse_on_another_episodes_actions_and_follows_the
     assert metrics["tool_command_cm_h12"] < metrics["tool_shuffled_cm_h12"] < 0.7 * standing_still
 
 
+@pytest.mark.slow
 def test_a_model_that_ignores_actions_loses_nothing_by_others(models: WorldModels) -> None:
     deaf = type(models.action)(
         CONFIG.world_model, num_tokens=models.tokenizer.num_tokens, latent_dim=models.tokenizer.latent_dim,
@@ -66,6 +68,7 @@ def test_a_model_that_ignores_actions_loses_nothing_by_others(models: WorldModel
     assert {value for name, value in metrics.items() if name.startswith("psnr_shuffled_drop")} == {0.0}
 
 
+@pytest.mark.slow
 def test_episodes_count_up_to_the_end_of_the_shorter_one_of_both(models: WorldModels) -> None:
     long, short = episode(1), episode(2, num_steps=4)
     metrics = controllability_metrics(models, stack_episodes([long, short], ("push_cube",), success), SPEC)

@@ -5,6 +5,7 @@ import threading
 
 import pytest
 import torch
+from deadlines import PATIENCE_S
 
 from wm_nodes.world_model.parts import PART, in_parallel, in_parts, parts_of
 
@@ -23,7 +24,7 @@ def test_parts_cover_the_batch_once_in_near_equal_sizes(batch: int) -> None:
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
 def test_parts_are_computed_at_the_same_time_with_one_torch_thread_each_and_without_gradients() -> None:
-    both = threading.Barrier(2, timeout=20)
+    both = threading.Barrier(2, timeout=PATIENCE_S)
 
     def work(item: int) -> tuple[int, bool, int]:
         both.wait()

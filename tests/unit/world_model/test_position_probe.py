@@ -9,17 +9,17 @@ from pushing_scene import episode, success
 from wm_nodes.config.load import load_config
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model.position_probe import PositionProbe
-from wm_nodes.world_model.tokenizer import PROBE_NAMES
+from wm_nodes.world_model.positions import columns_of, probe_targets
 from wm_nodes.world_model.training.position_probe import train_position_probe
-from wm_nodes.world_model.training.tokenizer import probe_targets
 
-OBJECT = [PROBE_NAMES.index(name) for name in ("object_x", "object_y")]
+OBJECT = columns_of("push_cube", "object")
 
 
 def arrays(count: int, first_seed: int = 0) -> EpisodeArrays:
     return stack_episodes([episode(first_seed + i) for i in range(count)], ("push_cube", "reach"), success)
 
 
+@pytest.mark.slow
 def test_a_trained_probe_reads_positions_of_episodes_it_has_not_seen(tmp_path: Path) -> None:
     config = load_config("base", {"tokenizer.num_iterations": 500, "tokenizer.batch_size": 32})
     probe, metrics = train_position_probe(arrays(120), config, 0, tmp_path)

@@ -299,6 +299,7 @@ def test_a_probe_that_trains_on_alone_reads_positions_better_off_unchanged_laten
     assert not any(p.requires_grad for p in tokenizer.probe.parameters())
 
 
+@pytest.mark.slow
 def test_a_decoder_for_rollouts_shows_them_closer_to_the_recording_and_leaves_the_tokenizer_alone(
     tmp_path: Path,
 ) -> None:

@@ -50,6 +50,7 @@ def train(config: RunConfig) -> dict[str, dict[str, float]]:
     return {"action_model": metrics, "decoder": decoder, "text_model": text[1]}
 
 
+@pytest.mark.slow
 def test_an_iteration_costs_few_kernels_one_wait_and_few_copies(
     device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -73,6 +74,7 @@ def test_an_iteration_costs_few_kernels_one_wait_and_few_copies(
         assert up <= copies, report
 
 
+@pytest.mark.slow
 def test_a_device_trains_as_the_cpu_does(device: Device) -> None:
     on_device = train(config_of(device.name, 4, **TOY))
     on_cpu = train(config_of("cpu", 4, **TOY))

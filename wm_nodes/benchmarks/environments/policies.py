@@ -30,7 +30,7 @@ from wm_nodes.policy_rl.factories import (
 )
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import prepare_start
-from wm_nodes.policy_rl.rollouts import collect_rollout, rollout_statistics
+from wm_nodes.policy_rl.rollouts import rollout_statistics
 from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.reward import RewardModel, RuleReward
 from wm_nodes.training.weights import save_weights
@@ -47,11 +47,14 @@ KEPT_EVERY = 6
 
 @dataclass(frozen=True)
 class Workplace:
-    """One seed of the main job. folder: of its starts and of the policy that training begins with; made there once."""
+    """One seed of the main job."""
 
     config: RunConfig
+    """Its seed is that of the job."""
     model_dir: Path
+    """The task's world model."""
     folder: Path
+    """Of its starts and of the policy that training begins with; made there once."""
 
     @cached_property
     def start(self) -> tuple[Path, Path]:
@@ -207,24 +210,6 @@ def spearman(x: ArrayLike, y: ArrayLike, *, seed: int, draws: int = 10_000) -> t
     drawn = drawn[np.isfinite(drawn)]
     low, high = np.quantile(drawn, (0.025, 0.975)) if len(drawn) else (np.nan, np.nan)
     return _correlation(first, second), float(low), float(high)
-
-
-def measure_speed(workplace: Workplace, models: Sequence[str], num_steps: int) -> list[dict[str, Any]]:
-    """Environment steps/s of a rollout in each model, one after the other, with those of the world model beside."""
-    policy, rows = workplace.policy(), list[dict[str, Any]]()
-    reward = make_endogenous_reward(workplace.config, workplace.model_dir)
-    for model in models:
-        env = workplace.environment(model)
-        collect_rollout(env, policy, reward, 1, workplace.config.seed, 0)
-        wall, used = time.perf_counter(), time.process_time()
-        rollout = collect_rollout(env, policy, reward, num_steps, workplace.config.seed, 1)
-        wall, used = time.perf_counter() - wall, time.process_time() - used
-        steps = rollout.valid_TN.size
-        rows.append({"model": model, "envs": env.spec.num_envs, "steps_per_s": steps / wall,
-                     "steps_per_cpu_s": steps / used})
-    for row in rows:
-        row["of_world_model"] = row["steps_per_cpu_s"] / rows[0]["steps_per_cpu_s"]
-    return rows
 
 
 def _correlation(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:

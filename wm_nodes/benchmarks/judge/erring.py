@@ -1,12 +1,9 @@
 """What planning, gates, votes and reflection gain and cost under a judge that errs at a known rate.
 
-    wm benchmark judge erring [CHECK_SET] [--seeds N] [--json FILE]
-
 The judge knows the labels of the clips (label_judge.py). Every way of judging meets the same errors, so that ways are
 compared in pairs; intervals are Student's, of 95 %, over seeds of the errors, on these clips.
 """
 
-import argparse
 import asyncio
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -15,14 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
+from benchmarks.experiment import Count, Experiment, console
 from benchmarks.judge.call_counter import CountingJudge
 from benchmarks.judge.label_judge import ClipLabels, Errors, LabelJudge
-from benchmarks.speed.results import write_results
 from benchmarks.video_rl.comparison import Difference, paired_interval
-from wm_nodes.apps.options import add_json, positive
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.statistics import balanced_accuracy
 from wm_nodes.judge.agent.machine import RewardAgent
@@ -43,20 +38,48 @@ AUDITED = {"nothing": (0, 0), "votes": (1, 0), "looks": (0, 1)}
 """Audit shares of votes and of second looks: of no clip, or of all, for the cost and finds per audited clip."""
 RATES, SHARES, AUDIT_RATE = (0.05, 0.1, 0.2), (0.0, 0.5, 1.0), 0.1
 MEASURES = ("accuracy", "components", "faults_accepted", "successes_kept", "silent", "calls", "images")
-console = Console()
+
+
+@dataclass(kw_only=True)
+class Erring(Experiment):
+    """What planning, gates, votes and reflection gain and cost under a judge that errs at a known rate."""
+
+    check_set: Path = CHECK_SET
+    """Folder of labelled clips; without, the shipped ones."""
+    seeds: Count = 20
+    """Of the errors, 2 at least."""
+
+    def run(self) -> None:
+        clips, rubric = load_check_set(self.check_set), load_rubric(PACKS[AGENT])
+        settings = [Errors(*one) for one in product(RATES, SHARES, (True, False))]
+        ways = asyncio.run(compare_ways(clips, settings, self.seeds))
+        audited = [errors for errors in settings if errors.rate == AUDIT_RATE]
+        audits = asyncio.run(measure_audits(clips, audited, self.seeds))
+        for start in range(0, len(ways), len(PACKS)):
+            console.print(ways_table(ways[start : start + len(PACKS)]))
+        console.print(audit_table(audits))
+        self.write({
+            "experiment": "erring", "clips": len(clips), "faults": sum(clip.truth.is_fault for clip in clips),
+            "successes": sum(clip.truth.success for clip in clips), "seeds": self.seeds, "packs": PACKS,
+            "rubric": rubric.version, "ways": ways, "audits": audits,
+            "audit_shares": {"votes": rubric.voting.audit_share, "looks": rubric.reflection.audit_share},
+        })
 
 
 @dataclass(frozen=True)
 class Judged:
-    """One clip, judged once. accepted: None without a verdict. passed: decision by component. flags: confirmed hacking
-    patterns. calls, images: asked of the judge.
-    """
+    """One clip, judged once."""
 
     accepted: bool | None
+    """None without a verdict."""
     passed: Mapping[str, bool]
+    """Decision by component."""
     flags: frozenset[str]
+    """Confirmed hacking patterns."""
     calls: int
+    """Asked of the judge."""
     images: int
+    """In those calls."""
 
 
 def labels_of(clips: Iterable[LabelledClip]) -> dict[str, ClipLabels]:
@@ -81,7 +104,7 @@ async def judge_clips(clips: Sequence[LabelledClip], judge: LabelJudge, rubric: 
         found.append(Judged(
             accepts(verdict) if verdict.valid else None, {score.component: score.passed for score in scores},
             frozenset(flag.pattern for flag in verdict.hack_flags if flag.confirmed),
-            counter.asked.calls, counter.asked.images,
+            counter.calls, counter.images,
         ))
     return found
 
@@ -194,29 +217,3 @@ def audit_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     measures = ("calls", "images", "mended", "spoiled", "hacks", "false_hacks")
     cells = [(_kind(row), row["audit"], *(_cell(name, row[name], True) for name in measures)) for row in rows]
     return make_table("per audited clip, percent of clips", ("errors", "audit", *measures), cells)
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("check_set", type=Path, nargs="?", default=CHECK_SET, help="labelled clips; the shipped ones")
-    parser.add_argument("--seeds", type=positive, default=20, help="of the errors, 2 at least (default: 20)")
-    add_json(parser)
-
-
-def run(arguments: argparse.Namespace) -> None:
-    """Measure, print and write --json."""
-    if not console.is_terminal:
-        console.width = 180
-    clips, rubric = load_check_set(arguments.check_set), load_rubric(PACKS[AGENT])
-    settings = [Errors(*one) for one in product(RATES, SHARES, (True, False))]
-    ways = asyncio.run(compare_ways(clips, settings, arguments.seeds))
-    audited = [errors for errors in settings if errors.rate == AUDIT_RATE]
-    audits = asyncio.run(measure_audits(clips, audited, arguments.seeds))
-    for start in range(0, len(ways), len(PACKS)):
-        console.print(ways_table(ways[start : start + len(PACKS)]))
-    console.print(audit_table(audits))
-    write_results(arguments, {
-        "experiment": "erring", "clips": len(clips), "faults": sum(clip.truth.is_fault for clip in clips),
-        "successes": sum(clip.truth.success for clip in clips), "seeds": arguments.seeds, "packs": PACKS,
-        "rubric": rubric.version, "ways": ways, "audits": audits,
-        "audit_shares": {"votes": rubric.voting.audit_share, "looks": rubric.reflection.audit_share},
-    })

@@ -20,28 +20,33 @@ SHARED, FIRST_VOTE, SECOND_LOOK, NUM_DRAWS = 0, 1, 8, 9
 
 @dataclass(frozen=True)
 class ClipLabels:
-    """passed: by component; where it is None or missing nobody knows, and the judge sees no fault. planning: level 0 to
-    3. completion: level 0 to 4. patterns: hacking patterns that are there.
-    """
+    """What the judge knows of a clip."""
 
     passed: Mapping[str, bool | None]
+    """By component; where it is None or missing nobody knows, and the judge sees no fault."""
     planning: int
+    """Level 0 to 3."""
     completion: int
+    """Level 0 to 4."""
     patterns: frozenset[str] = frozenset()
+    """Hacking patterns that are there."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """rate: share of reads that are wrong. shared: correlation of the errors of two reads of one component of one clip;
-    at 1 all votes and second looks repeat one answer. honest: a read is as sure as it is often right; else always sure.
+    """How a judge errs.
 
     Raises:
         ValueError: rate is outside [0, 0.5], or shared outside [0, 1].
     """
 
     rate: float = 0.0
+    """Share of reads that are wrong."""
     shared: float = 0.0
+    """Correlation of the errors of two reads of one component of one clip; at 1 all votes and second looks repeat one
+    answer."""
     honest: bool = False
+    """A read is as sure as it is often right; else always sure."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.rate <= 0.5 and 0 <= self.shared <= 1):

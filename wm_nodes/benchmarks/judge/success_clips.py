@@ -1,58 +1,105 @@
 """A judge against public sets of recorded episodes in a local folder, through the reward agent's own service.
 
-    wm benchmark judge success-clips FOLDER --format roboreward --judge http://host:8000/v1 --judge-model NAME
-
-roboreward: FOLDER is the data set teetone/RoboReward (RoboRewardBench is its part test) or one of its parts, as it is
-published: metadata.jsonl beside the videos, a line each {"file_name": "SOURCE/NAME.mp4", "task": "...", "reward": 1 to
+roboreward: metadata.jsonl beside the videos, a line each {"file_name": "SOURCE/NAME.mp4", "task": "...", "reward": 1 to
 5}. Success is reward 5. The mean absolute error (MAE) is that of the score 1 + 4 R, as it is and rounded.
-rt1: episodes with a success label. RT-1 is published as RLDS shards, and no layout of videos with failures could be
-established; so FOLDER holds the videos and labels.csv with the columns file, instruction, label (1 or 0).
-
-With --mode topreward, --prefixes K also reads K prefixes of every successful clip: VOC is the rank correlation of
-log p(True) with time, 0 where all are equal. Nothing is downloaded. Clips without a reward are counted, never scored.
+rt1: RT-1 is published as RLDS shards, and no layout of videos with failures could be established; so the folder holds
+the videos and labels.csv. Clips without a reward are counted, never scored.
 """
 
 import argparse
 import csv
 import json
-import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from benchmarks.environments.policies import spearman
-from benchmarks.speed.results import write_results
-from wm_nodes.apps.options import add_device, add_json, add_judge, add_seed, device_settings, judge_settings, positive
+from benchmarks.experiment import Count, OnDevice
+from wm_nodes.apps import options
 from wm_nodes.config.load import load_config
 from wm_nodes.core.files import text_lines
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.statistics import auroc, bootstrap_mean, wilson_interval
-from wm_nodes.judge.agent import topreward
-from wm_nodes.judge.agent.types import ClipRef, clip_ref
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.clip_files import ClipLine, read_job
 from wm_nodes.judge.decisions import accepts
-from wm_nodes.judge.service import ClipJob, JudgeService
+from wm_nodes.judge.service import JudgeService
 
 METADATA, TABLE, TEST, COLUMNS = "metadata.jsonl", "labels.csv", "test", {"file", "instruction", "label"}
 TOP_SCORE, ROBOT, DRAWS = 5, "not told", 1000
-NUM_PREFIXES = 15
-"""Of a curve, as published."""
+
+
+@dataclass(kw_only=True)
+class SuccessClips(OnDevice):
+    """A judge against public sets of recorded episodes in a local folder, through the reward agent's own service.
+
+    roboreward: FOLDER is the data set teetone/RoboReward (RoboRewardBench is its part test) or one of its parts, as it
+    is published: metadata.jsonl beside the videos. rt1: episodes with a success label, the videos and labels.csv with
+    the columns file, instruction, label (1 or 0). Nothing is downloaded.
+    """
+
+    folder: Path
+    """Of the episodes."""
+    format: Literal["roboreward", "rt1"]
+    """Of the folder."""
+    mode: Literal["reward", "topreward"] = "reward"
+    """Of the judge."""
+    clips: Count | None = None
+    """The first so many; without, all."""
+    reads: Path | None = None
+    """Folder that keeps a server's answers."""
+    seed: int = 0
+    """Of the judge, and of the bootstrap."""
+
+    @classmethod
+    def add_settings(cls, parser: argparse.ArgumentParser) -> None:
+        options.add_judge(parser)
+
+    @classmethod
+    def settings_of(cls, arguments: argparse.Namespace) -> dict[str, Any]:
+        return options.judge_settings(arguments)
+
+    def run(self) -> None:
+        """Judge the clips, print the numbers and write --json."""
+        config = load_config("cpu", {**self.settings, "device": self.device, "judge.mode": self.mode})
+        folder, videos = FORMATS[self.format](self.folder)
+        videos = videos[: self.clips]
+        rows, size = list[Verdict](), config.judge.concurrency
+        judge = JudgeService(config.judge, seed=self.seed, reads=self.reads, device=config.device)
+        with closing(judge), tqdm(total=len(videos), desc="judged", unit="clip") as bar:
+            for part in (videos[start : start + size] for start in range(0, len(videos), size)):
+                lines = [ClipLine(file=video.file, instruction=video.instruction, robot=ROBOT) for video in part]
+                rows += judge.judge([read_job(folder, line) for line in lines])
+                bar.update(len(part))
+        results = _results(videos, rows, self.seed)
+        for name in ("clips", "statuses", "decided", "accuracy", "f1", "auroc", "mae", "mae_rounded"):
+            if name in results:
+                shown = results[name]
+                form = "{:.3f} ({:.3f} to {:.3f})"
+                print(f"{name:12} " + (form.format(*shown) if len(np.shape(shown)) else str(shown)))
+        self.write({
+            "experiment": "success-clips", "format": self.format, "judge": judge.judge_id, "mode": self.mode,
+            "rubric": judge.version, "seed": self.seed, **results,
+        })
 
 
 class LabelledVideo(NamedTuple):
-    """score: 1 to 5, None where only success is labelled."""
+    """An episode with what people say of it."""
 
     file: str
+    """Of the video, in the folder."""
     instruction: str
+    """Of the task."""
     success: bool
+    """Whether it was done."""
     score: int | None = None
+    """1 to 5, None where only success is labelled."""
 
 
 def read_roboreward(folder: Path) -> tuple[Path, list[LabelledVideo]]:
@@ -136,78 +183,11 @@ def _bootstrapped(statistic: Callable[[Any, Any], float], one: Any, other: Any, 
     return [statistic(one, other), float(low), float(high)]
 
 
-def prefixes(clip: ClipRef, count: int) -> list[ClipRef]:
-    """`count` prefixes of a clip, the last one whole; fewer of a short one, because each has 2 frames or more."""
-    ends = sorted({int(end) for end in np.linspace(2, len(clip.frames), count).round()})
-    return [clip_ref(f"{clip.clip_id}[:{end}]", clip.frames[:end], clip.fps, clip.source) for end in ends]
-
-
-def log_p_true(verdict: Verdict) -> float:
-    """log p("True"), not normalised over both words. NaN without a number, -inf where p is 0."""
-    reads = [read for stage in verdict.stages for score in stage.components for read in score.votes]
-    if not verdict.valid or not reads:
-        return math.nan
-    p_true = reads[0].levels[-1] * reads[0].label_mass
-    return math.log(p_true) if p_true > 0 else -math.inf
-
-
-def voc(judge: JudgeService, job: ClipJob, count: int) -> float:
-    """Value-order correlation of a clip's progress; NaN where a prefix has no number."""
-    jobs = [ClipJob(clip, job.task) for clip in prefixes(job.clip, count)]
-    values = [log_p_true(verdict) for verdict in judge.judge(jobs)]
-    if np.isnan(values).any():
-        return float("nan")
-    return 0.0 if len(set(values)) == 1 else spearman(values, range(len(values)), seed=0, draws=0)[0]
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--format", choices=FORMATS, required=True)
-    parser.add_argument("--mode", choices=("reward", topreward.MODE), default="reward", help="of the judge")
-    parser.add_argument("--clips", type=positive, help="the first so many; default: all")
-    parser.add_argument("--prefixes", type=positive, metavar="K", help=f"as published: {NUM_PREFIXES}")
-    parser.add_argument("--reads", type=Path, help="folder that keeps a server's answers")
-    add_judge(parser)
-    add_device(parser)
-    add_seed(parser)
-    add_json(parser)
-
-
-def run(arguments: argparse.Namespace) -> None:
-    """Judge the clips, print the numbers and write --json."""
-    if arguments.prefixes and arguments.mode != topreward.MODE:
-        raise ValueError(f"--prefixes {arguments.prefixes} needs --mode topreward")
-    chosen = judge_settings(arguments) | device_settings(arguments) | {"judge.mode": arguments.mode}
-    config = load_config("cpu", chosen)
-    folder, videos = FORMATS[arguments.format](arguments.folder)
-    videos = videos[: arguments.clips]
-    rows, curves, size = list[Verdict](), list[float](), config.judge.concurrency
-    judge = JudgeService(config.judge, seed=arguments.seed, reads=arguments.reads, device=config.device)
-    with closing(judge), tqdm(total=len(videos), desc="judged", unit="clip") as bar:
-        for part in (videos[start : start + size] for start in range(0, len(videos), size)):
-            lines = [ClipLine(file=video.file, instruction=video.instruction, robot=ROBOT) for video in part]
-            jobs = [read_job(folder, line) for line in lines]
-            rows += judge.judge(jobs)
-            if arguments.prefixes:
-                curves += [voc(judge, j, arguments.prefixes) for j, v in zip(jobs, part) if v.success and not j.problem]
-            bar.update(len(part))
-    results = _results(videos, rows, [value for value in curves if not np.isnan(value)], arguments.seed)
-    for name in ("clips", "statuses", "decided", "accuracy", "f1", "auroc", "mae", "mae_rounded", "voc"):
-        if name in results:
-            shown = results[name]
-            print(f"{name:12} " + ("{:.3f} ({:.3f} to {:.3f})".format(*shown) if len(np.shape(shown)) else str(shown)))
-    write_results(arguments, {
-        "experiment": "success-clips", "format": arguments.format, "judge": judge.judge_id, "mode": arguments.mode,
-        "rubric": judge.version, "seed": arguments.seed, **results,
-    })
-
-
-def _results(videos: Sequence[LabelledVideo], rows: list[Verdict], curves: list[float], seed: int) -> dict[str, Any]:
+def _results(videos: Sequence[LabelledVideo], rows: list[Verdict], seed: int) -> dict[str, Any]:
     rewards, accepted = [row.reward for row in rows], [accepts(row) for row in rows]
     results = {
         "clips": len(videos), "statuses": dict(Counter(str(row.status) for row in rows)),
         **success_numbers([video.success for video in videos], accepted, rewards, seed),
-        **({"voc": bootstrap_mean(curves, seed=seed), "curves": len(curves)} if curves else {}),
     }
     if all(video.score is not None for video in videos):
         results |= score_errors([video.score or 0 for video in videos], rewards, seed)

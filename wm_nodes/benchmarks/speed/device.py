@@ -1,25 +1,21 @@
-"""`wm benchmark speed --device`: everything that a short time with a GPU should bring home, in one JSON."""
+"""What a short time with a GPU should bring home, in one JSON."""
 
-import argparse
 import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from rich.table import Table
 
+from benchmarks.experiment import NO_OPTION, Experiment, console
 from benchmarks.speed.device_agreement import COMPARED, agreement_points
-from benchmarks.speed.device_ceilings import ceiling_points, host_points, launch_points, simulator_points
-from benchmarks.speed.device_models import Models, imagination_points, ppo_points, training_points, video_points
+from benchmarks.speed.device_models import Models, imagination_points, training_points
 from benchmarks.speed.device_suite import CPU_PLAN, GPU_PLAN, INTERRUPTED, Plan, Point, Suite, number_text, spread_text
-from benchmarks.speed.inputs import console
-from benchmarks.speed.results import write_results
 from wm_nodes.apps.cli import DIFFERENT, DONE
 from wm_nodes.apps.cli import INTERRUPTED as STOPPED
-from wm_nodes.config.load import load_config
 from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.core.device import CPU, compute_device, device_label
 from wm_nodes.reports.console_table import make_table
@@ -27,49 +23,65 @@ from wm_nodes.reports.console_table import make_table
 NO_GPU = "nothing was measured on a GPU"
 
 
-def run_device(arguments: argparse.Namespace) -> int:
-    """Measure `arguments.plan` (None: the one for this device), show the tables, write --json; return the exit code."""
-    device = compute_device(arguments.device)
-    name = str(device)
-    small = replace(CPU_PLAN, captured=name != CPU)
-    plan: Plan = arguments.plan or (small if name == CPU or arguments.quick else GPU_PLAN)
-    if arguments.minutes is not None:
-        plan = replace(plan, minutes=arguments.minutes)
-    if name != CPU:
-        torch.cuda.set_device(device)
-    keep_freed_memory()
-    torch.set_num_threads(plan.threads or len(os.sched_getaffinity(0)))
-    facts = {
-        "device": device_label(device), "note": NO_GPU if name == CPU else "", "seed": arguments.seed,
-        "configuration": asdict(plan), "torch_threads": torch.get_num_threads(), "numerics": numerics(),
-    }
+@dataclass(kw_only=True)
+class DeviceSpeed(Experiment):
+    """What a GPU makes of both loops, in five minutes and one process: imagined steps/s by number of environments and
+    size of model, training, memory, and how far its numbers are from the CPU's.
+    """
 
-    def keep(suite: Suite) -> None:
-        found = {"state": suite.state, "seconds": suite.spent_s, **suite.results, "skipped": suite.skipped}
-        write_results(arguments, facts | found, device=name)
+    device: str = "auto"
+    """Where to measure: cpu, cuda, cuda:N or auto."""
+    quick: bool = False
+    """The plan of a CPU, for a first look at a GPU."""
+    minutes: float | None = None
+    """What would begin later is left out, and listed (default: 5)."""
+    seed: int = 0
+    """Of every random number."""
+    plan: Plan | None = field(default=None, metadata=NO_OPTION)
+    """None: the one for this device."""
 
-    suite = Suite(device, plan, lambda line: console.print(line, highlight=False, markup=False, soft_wrap=True), keep)
-    suite.say(f"{facts['device']}, torch threads: {torch.get_num_threads()}, at most {plan.minutes:g} minutes")
-    keep(suite)  # a file that cannot be written is found now
-    with tempfile.TemporaryDirectory(prefix="wm_benchmark_") as folder:
-        suite.run(all_points(plan, Models(name, arguments.seed, Path(folder)), name))
-    keep(suite)
-    for table in tables(suite.results):
-        console.print(table)
-    for line in closing_lines(suite, name):
-        suite.say(line)
-    if arguments.json is not None:
-        suite.say(f"written to {arguments.json}")
-    return STOPPED if suite.state == INTERRUPTED else DIFFERENT if suite.failed else DONE
+    def run(self) -> int:
+        """Measure the plan, show the tables, write --json; return the exit code."""
+        device = compute_device(self.device)
+        name = str(device)
+        small = replace(CPU_PLAN, captured=name != CPU)
+        plan = self.plan or (small if name == CPU or self.quick else GPU_PLAN)
+        if self.minutes is not None:
+            plan = replace(plan, minutes=self.minutes)
+        if name != CPU:
+            torch.cuda.set_device(device)
+        keep_freed_memory()
+        torch.set_num_threads(plan.threads or len(os.sched_getaffinity(0)))
+        facts = {
+            "device": device_label(device), "note": NO_GPU if name == CPU else "", "seed": self.seed,
+            "configuration": asdict(plan), "torch_threads": torch.get_num_threads(), "numerics": numerics(),
+        }
+
+        def keep(suite: Suite) -> None:
+            found = {"state": suite.state, "seconds": suite.spent_s, **suite.results, "skipped": suite.skipped}
+            self.write(facts | found, device=name)
+
+        suite = Suite(
+            device, plan, lambda line: console.print(line, highlight=False, markup=False, soft_wrap=True), keep
+        )
+        suite.say(f"{facts['device']}, torch threads: {torch.get_num_threads()}, at most {plan.minutes:g} minutes")
+        keep(suite)  # a file that cannot be written is found now
+        with tempfile.TemporaryDirectory(prefix="wm_benchmark_") as folder:
+            suite.run(all_points(plan, Models(name, self.seed, Path(folder)), name))
+        keep(suite)
+        for table in tables(suite.results):
+            console.print(table)
+        for line in closing_lines(suite, name):
+            suite.say(line)
+        if self.json is not None:
+            suite.say(f"written to {self.json}")
+        return STOPPED if suite.state == INTERRUPTED else DIFFERENT if suite.failed else DONE
 
 
 def all_points(plan: Plan, models: Models, device: str) -> list[Point]:
     """In order of worth, since a time that ends leaves out the last ones."""
-    config = load_config("cpu", {"seed": models.seed})
     return [
-        *launch_points(plan), *agreement_points(plan, models, device), *imagination_points(plan, models),
-        *training_points(plan, models), *ppo_points(plan, models), *video_points(plan, models),
-        *ceiling_points(plan, device), *host_points(plan, config), *simulator_points(plan, config),
+        *agreement_points(plan, models, device), *imagination_points(plan, models), *training_points(plan, models),
     ]
 
 
@@ -97,21 +109,14 @@ def tables(results: Mapping[str, Sequence[Mapping[str, Any]]]) -> Iterator[Table
         )
     if rows := [row for row in results.get("agreement", ()) if "terminated_equal" in row]:
         yield agreement_table(rows)
-    for title, groups, memory in (
-        ("training", ("training", "ppo", "grpo"), ("peak memory, MiB",)),
-        ("what bounds it, and the simulator", ("launch", "ceilings", "host", "simulator"), ()),
-    ):
-        found = [(group, row) for group in groups for row in results.get(group, ())]
-        if found:
-            yield make_table(
-                title, ("", "what", "median", "unit", "n", *memory),
-                (
-                    (group, row["point"], spread_text(row), row["unit"], row["n"],
-                     *(number_text(row["peak_mib"]) for _ in memory))
-                    for group, row in found
-                ),
-                left=("", "what", "unit"),
-            )
+    if rows := results.get("training"):
+        yield make_table(
+            "training", ("what", "median", "unit", "n", "peak memory, MiB"),
+            (
+                (row["point"], spread_text(row), row["unit"], row["n"], number_text(row["peak_mib"])) for row in rows
+            ),
+            left=("what", "unit"),
+        )
 
 
 def agreement_table(rows: Sequence[Mapping[str, Any]]) -> Table:

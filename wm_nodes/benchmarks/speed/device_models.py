@@ -1,4 +1,4 @@
-"""Both loops on a device: imagined steps, training iterations, PPO and GRPO updates, of several sizes of model."""
+"""Both loops on a device: imagined steps and training iterations, of several sizes of model."""
 
 import io
 from collections.abc import Callable, Iterator, Mapping
@@ -11,10 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.speed.device_suite import DISC, ModelSize, Plan, Point, Stopwatch
+from benchmarks.speed.device_suite import ModelSize, Plan, Point, Stopwatch
 from benchmarks.speed.inputs import TOOL_DIM, prepare_model, random_model
-from benchmarks.video_rl.cost import GROUP, SCENES, pushcube_buffer, toy_buffer
-from wm_nodes.config.load import load_config, load_video_config
+from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task, model_tasks
 from wm_nodes.core.seeding import numpy_stream
@@ -27,12 +26,9 @@ from wm_nodes.policy_rl.factories import (
     make_policy,
     models_of,
 )
-from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.rollouts import collect_rollout
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.loop import LossFunction, TrainingLoop
-from wm_nodes.video_rl.grpo import GrpoLearner
-from wm_nodes.video_rl.toy_scene import load_base
 from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
 
@@ -48,11 +44,14 @@ ITERATION = "_step"
 
 @dataclass(frozen=True)
 class Model:
-    """config: on the device, with episodes that never terminate, so that every step counts."""
+    """A model that rollouts are made in."""
 
     config: RunConfig
+    """On the device, with episodes that never terminate, so that every step counts."""
     folder: Path
+    """Of the weights."""
     starts: Path
+    """First frames."""
 
 
 class Models:
@@ -212,40 +211,3 @@ def random_episodes(config: RunConfig, steps: int) -> EpisodeArrays:
         success=rng.random((*frames, len(tasks))) < 0.2, lengths=np.full(EPISODES, steps), tasks=tasks,
         instructions=("",) * EPISODES, behaviours=("random",) * EPISODES, recorded_tasks=(config.task,) * EPISODES,
     )
-
-
-def ppo_points(plan: Plan, models: Models) -> Iterator[Point]:
-    """Milliseconds of an update with all its epochs, on a rollout in the first of the plan's models."""
-
-    def measure(watch: Stopwatch, preset: str, envs: int) -> list[float]:
-        size = plan.models[0]
-        model = models.at(size, size.sizes_px[0])
-        settings = load_config(preset).ppo.model_copy(update={"target_kl": 0.0, "value_warmup_updates": 0})
-        policy = make_policy(model.config, model.folder)
-        learner = PpoLearner(policy, settings, seed=model.config.seed)
-        rollout = collector(model, envs, captured=False).collect(plan.num_steps, models.seed, 1)
-        return [1e3 * s for s in watch.repeats(partial(learner.update, rollout))]
-
-    for preset, envs in plan.ppo:
-        what = {"preset": preset, "envs": envs}
-        yield Point("ppo", what, "ms", partial(measure, preset=preset, envs=envs), "envs")
-
-
-def video_points(plan: Plan, models: Models) -> Iterator[Point]:
-    """Loop 2: milliseconds of training a shipped video model on one buffer of its clips."""
-
-    def measure(watch: Stopwatch, name: str) -> list[float]:
-        settings = load_video_config("recommended").grpo.with_values(learning_rate=0.0)
-        if name == DISC:
-            network = load_base(device=watch.device)
-            buffer, rollout = toy_buffer(network, models.seed)
-        else:
-            network, (buffer, rollout) = pushcube_buffer(models.seed, watch.device)
-
-        def update() -> None:
-            GrpoLearner(network, settings, rollout, seed=models.seed).train(buffer)
-
-        return [1e3 * s for s in watch.repeats(update)]
-
-    for name in plan.videos:
-        yield Point("grpo", {"model": name, "clips": SCENES * GROUP}, "ms", partial(measure, name=name))

@@ -17,13 +17,8 @@ from wm_nodes.core.errors import RunError
 NOT_HERE = (RunError, DeviceError, OSError, ImportError)
 """Errors of a machine that lacks something, e.g. a renderer; any other is a fault, which the exit code tells."""
 MOST_REPEATS, FEWEST_REPEATS = 30, 3
-DISC = "moving disc"
-"""The small one of the shipped video models."""
 RUNNING, INTERRUPTED, FINISHED = "running", "interrupted", "finished"
-WORDS = {
-    "px": "{} px", "envs": "{} environments", "batch": "batch {}", "preset": "preset {}", "processes": "{} processes",
-    "clips": "{} clips",
-}
+WORDS = {"px": "{} px", "envs": "{} environments", "batch": "batch {}"}
 """How a column of that name is put in words."""
 LAST_LINES = 2000
 """Characters of a failed point's traceback that are kept."""
@@ -31,60 +26,59 @@ LAST_LINES = 2000
 
 @dataclass(frozen=True)
 class ModelSize:
-    """preset: of policies, whose tokenizer and world model it is. sizes_px: of each camera's picture. shipped_px: at
-    which such a model is shipped; 0: none is, and weights are random."""
+    """A size of world model and policy."""
 
     name: str
+    """In the results."""
     preset: str
+    """Of policies, whose tokenizer and world model it is."""
     sizes_px: tuple[int, ...]
+    """Of each camera's picture."""
     shipped_px: int = 0
+    """At which such a model is shipped; 0: none is, and weights are random."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is measured.
-
-    models: in which imagined steps are counted. trained: whose training is timed, at their presets' picture size, with
-    batch_shares of their presets' batches.
-    envs: of rollouts on the device. loop_envs: of the lock-step loop. host_envs: of that loop with costless models.
-    ppo: (preset, environments). videos: shipped video models, for loop 2. iterations: of each training of loop 1.
-    threads: of torch; 0: one per core. seconds: of the repeats of a point. minutes: points that would begin later are
-    left out.
-    memory_mib: of the device that may be used; None: what is free.
-    """
+    """What is measured."""
 
     models: tuple[ModelSize, ...]
+    """In which imagined steps are counted."""
     envs: tuple[int, ...]
+    """Environments of rollouts on the device."""
     loop_envs: tuple[int, ...]
-    host_envs: tuple[int, ...]
+    """Environments of the lock-step loop."""
     trained: tuple[ModelSize, ...]
+    """Whose training is timed, at their presets' picture size."""
     batch_shares: tuple[float, ...]
-    ppo: tuple[tuple[str, int], ...]
-    videos: tuple[str, ...] = (DISC, "PushCube")
+    """Of their presets' batches."""
     agreement_envs: int = 64
+    """Environments of the rollout that is compared with the CPU's."""
     num_steps: int = 16
+    """Of every rollout."""
     iterations: int = 10
-    kernels: int = 2000
-    product_size: int = 8192
-    copy_mib: int = 2048
-    simulator_blocks: int = 3
+    """Of each training of loop 1."""
     captured: bool = True
+    """Also with CUDA graphs."""
     threads: int = 0
+    """Of torch; 0: one per core."""
     seconds: float = 0.3
+    """Of the repeats of a point."""
     minutes: float = 5.0
+    """Points that would begin later are left out."""
     memory_mib: float | None = None
+    """Of the device that may be used; None: what is free."""
 
 
 SHIPPED = ModelSize("shipped", "cpu_full", (64, 128), shipped_px=64)
 LARGE, SMALL = ModelSize("gpu", "gpu", (64, 128)), ModelSize("smoke", "smoke", (64, 128))
 GPU_PLAN = Plan(
-    models=(SHIPPED, LARGE), envs=(64, 256, 1024, 4096), loop_envs=(64,), host_envs=(64, 256, 1024, 4096),
-    trained=(SHIPPED, LARGE), batch_shares=(0.25, 1.0), ppo=(("cpu", 64), ("gpu", 1024)),
+    models=(SHIPPED, LARGE), envs=(64, 256, 1024, 4096), loop_envs=(64,),
+    trained=(SHIPPED, LARGE), batch_shares=(0.25, 1.0),
 )
 CPU_PLAN = Plan(
-    models=(replace(SHIPPED, sizes_px=(64,)), SMALL), envs=(64,), loop_envs=(64,), host_envs=(64,),
-    trained=(SHIPPED, SMALL), batch_shares=(0.125,), ppo=(("cpu", 64),), iterations=4, kernels=500, product_size=1024,
-    videos=(DISC,), copy_mib=64, simulator_blocks=1, captured=False, threads=1,
+    models=(replace(SHIPPED, sizes_px=(64,)), SMALL), envs=(64,), loop_envs=(64,), trained=(SHIPPED, SMALL),
+    batch_shares=(0.125,), iterations=4, captured=False, threads=1,
 )
 """The same code where there is no GPU, or for a first look at one."""
 
@@ -116,17 +110,18 @@ class Stopwatch:
 
 @dataclass(frozen=True)
 class Point:
-    """One measurement.
-
-    group: of results. what: the columns that name it among those of its group. unit: of its values.
-    measure: returns the values of its repeats, or several named numbers. grows_with: the column its memory grows with.
-    """
+    """One measurement."""
 
     group: str
+    """Of the results."""
     what: Mapping[str, Any]
+    """The columns that name it among those of its group."""
     unit: str
+    """Of its values."""
     measure: Callable[[Stopwatch], Sequence[float] | Mapping[str, float]]
+    """Returns the values of its repeats, or several named numbers."""
     grows_with: str = ""
+    """The column that its memory grows with."""
 
     @property
     def name(self) -> str:

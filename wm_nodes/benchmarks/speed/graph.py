@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.speed.inputs import Effort, console, interleave, time_episode, time_steps
+from benchmarks.experiment import console
+from benchmarks.speed.inputs import Effort, interleave, time_episode, time_steps
 from wm_nodes.config.load import dump_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.policy_rl.factories import make_imagined_environment
@@ -30,12 +31,15 @@ def measure_graph(config: RunConfig, effort: Effort, folder: Path, model: Path, 
 
     config_file = folder / "config.yaml"
     config_file.write_text(dump_config(config), encoding="utf-8")
+    factory = {"factory": "benchmarks.speed.noop_environment:make_noop_environment"}
+    still_file = folder / "still.yaml"
+    still_file.write_text(dump_config(config.with_values(environment=factory)), encoding="utf-8")
     common: dict[str, ParameterValue] = {
         "config_file": str(config_file), "run_dir": str(folder), "num_envs": GRAPH_ENVS, "seed": config.seed,
     }
     served: dict[str, ParameterValue] = {"backend": "world_model", "model_dir": str(model), "starts_file": str(starts)}
     still: dict[str, ParameterValue] = {
-        "backend": "factory", "backend_factory": "benchmarks.speed.noop_environment:make_noop_environment",
+        "backend": "environment", "config_file": str(still_file),
     }
     module = "wm_nodes.nodes.environment_node"
     graph_nodes = (

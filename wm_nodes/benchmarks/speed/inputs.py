@@ -12,7 +12,6 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.console import Console
 from safetensors.torch import save_file
 
 from wm_nodes.config.schema import RunConfig
@@ -33,7 +32,6 @@ NUM_STARTS = 64
 TOOL_DIM = len(TRANSLATION.units)
 """Of actions and states."""
 
-console = Console()
 T = TypeVar("T")
 
 
@@ -42,9 +40,13 @@ class Effort:
     """How much is measured. Blocks are one episode long; a first one of each kind warms up and does not count."""
 
     overhead_blocks: int
+    """Of the graph, and as many in one process."""
     growth_steps: int
+    """Of the environment that costs nothing."""
     simulator_blocks: int
+    """Of each simulator, and as many imagined ones."""
     stage_repeats: int
+    """Of each stage."""
 
 
 def prepare_model(config: RunConfig, folder: Path, given: Path | None) -> tuple[Path, Path, str]:

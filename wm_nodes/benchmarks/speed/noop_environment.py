@@ -52,5 +52,5 @@ class NoopEnvironment:
 
 
 def make_noop_environment(config: RunConfig, num_envs: int, seed: int) -> NoopEnvironment:
-    """backend_factory of the second environment node."""
+    """environment.factory of the second environment node."""
     return NoopEnvironment(configured_spec(config, num_envs))

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.speed.inputs import Effort, actions_of, console, interleave, seeds_of
+from benchmarks.experiment import console
+from benchmarks.speed.inputs import Effort, actions_of, interleave, seeds_of
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.core.errors import RunError

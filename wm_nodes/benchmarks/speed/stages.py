@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.speed.inputs import Effort, console
+from benchmarks.experiment import console
+from benchmarks.speed.inputs import Effort
 from benchmarks.speed.simulator import IMAGINED_ENVS
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.seeding import numpy_stream

@@ -5,39 +5,29 @@ Compute of a buffer, in forwards of one clip: contexts x history x steps for the
 steps for the groups, TRAINING_CALLS for each (clip, step) or (clip, time) that trains, and one more with NFT.
 """
 
-import argparse
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
-from rich.console import Console
 
-from benchmarks.video_rl import plots, tables
+from benchmarks.experiment import Count, console
+from benchmarks.video_rl import tables
+from benchmarks.video_rl.comparison import SamplerComparison
 from benchmarks.video_rl.controls import TRAINING_CALLS, FlowMatchingLearner, RecordedTargets
 from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers
 from benchmarks.video_rl.sources import TASK, config_of, reward_spread
-from benchmarks.video_rl.trainings import (
-    add_training_options,
-    compare,
-    draw,
-    load_recordings,
-    row_name,
-    train_all,
-    with_rate,
-)
+from benchmarks.video_rl.trainings import OnIteration, RecordedTrainings, row_name
 from benchmarks.video_rl.trials import SamplerTrial
-from wm_nodes.apps.options import positive
 from wm_nodes.config.seed_ranges import seed_spans
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips
-from wm_nodes.video_model.folder import VideoFolder, load_video_folder, save_video_folder
+from wm_nodes.video_model.folder import VideoFolder, save_video_folder
 from wm_nodes.video_model.success_reader import SUCCESS_MANIFEST, WEIGHTS
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.horizons import horizon_scores
@@ -52,17 +42,20 @@ DRAWS, UPDATES = 4, 4
 MEASURES = ("error_cm", "error_cm_path", "win", "object_cm", "tool_cm", "psnr_db")
 SCORES = ("tracking", "object_cm", "tool_cm", "psnr_db", "scenery")
 SHOWN = ("error_cm", "win", "object_cm", "tool_cm", "psnr_db", "object_cm_4", "tool_cm_4")
-console = Console()
 
 
 @dataclass(frozen=True)
 class ClosedLoopPlan(LearningPlan):
-    """eval_contexts: held-out episodes, rolled out whole. history: clips at most before those of a group."""
+    """Held-out episodes are rolled out whole."""
 
     iterations: int = 30
+    """Buffers."""
     contexts: int = 8
+    """Of a buffer, 8 clips each."""
     eval_every: int = 10
+    """Buffers."""
     history: int = 2
+    """Clips at most before those of a group."""
 
 
 def closed_loop_samplers() -> list[SamplerSetup]:
@@ -151,39 +144,52 @@ def train_arm(
     return {**row, "learning_rate": sampler.grpo.learning_rate, "calls": calls}
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    add_training_options(parser, ClosedLoopPlan, "video_model_closed_loop", range(5))
-    parser.add_argument("--contexts", type=positive, default=ClosedLoopPlan.contexts, help="per buffer, 8 clips each")
-    parser.add_argument("--eval-every", type=positive, default=ClosedLoopPlan.eval_every)
-    parser.add_argument("--models", type=Path, metavar="FOLDER", help="keep the trained models here, a folder each")
+@dataclass(kw_only=True)
+class ClosedLoop(RecordedTrainings[ClosedLoopPlan]):
+    """A video model that goes on from its own frames, post-trained on continuations of its own histories, by group
+    methods and by controls of the same compute."""
 
+    video_model: Path = shipped_model(TASK) / "video_model_closed_loop"
+    """Folder that training begins with."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """A training of each sampler for each."""
+    iterations: Count = ClosedLoopPlan.iterations
+    """Buffers of each training."""
+    contexts: Count = ClosedLoopPlan.contexts
+    """Of a buffer, 8 clips each."""
+    eval_contexts: Count = ClosedLoopPlan.eval_contexts
+    """Held-out episodes."""
+    eval_every: Count = ClosedLoopPlan.eval_every
+    """Buffers between two evaluations."""
+    models: Path | None = None
+    """Keep the trained models here, a folder each."""
 
-def run(arguments: argparse.Namespace) -> None:
-    """Train every arm at every seed; compare each with the others."""
-    base = load_video_folder(arguments.video_model, arguments.device)
-    plan = ClosedLoopPlan(
-        arguments.iterations, arguments.contexts, eval_contexts=arguments.eval_contexts, eval_every=arguments.eval_every
-    )
-    arms = with_rate(closed_loop_samplers(), arguments.learning_rate)
-    trials, of = [SamplerTrial(arm, plan) for arm in arms], {"sha256": base.manifest["sha256"]}
-    rows = train_all(arguments, trials, partial(_train, arguments), of, arguments.workers)
-    comparisons = compare(arguments, trials, rows, _pairs(rows), of, MEASURES)
-    draw(arguments, plots.plot_comparisons, comparisons)
-    shown = [name for name in SHOWN if name in rows[0]["evaluations"][0]]  # shorter rollouts have no fourth clip
-    console.print(tables.gain_table(rows, shown), tables.comparison_table(comparisons))
+    measures: ClassVar = MEASURES
 
+    def trials(self) -> list[SamplerTrial[ClosedLoopPlan]]:
+        plan = ClosedLoopPlan(
+            self.iterations, self.contexts, eval_contexts=self.eval_contexts, eval_every=self.eval_every
+        )
+        return [SamplerTrial(arm, plan) for arm in self.with_rate(closed_loop_samplers())]
 
-def _train(
-    arguments: argparse.Namespace, trial: SamplerTrial[ClosedLoopPlan], seed: int, on_iteration: Callable[[], object]
-) -> dict[str, Any]:
-    folder = load_video_folder(arguments.video_model, arguments.device)
-    contexts, heldout = load_recordings(arguments, folder, trial.plan.eval_contexts)
-    probe = load_probe(shipped_model(TASK), arguments.device)
-    row = train_arm(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed, on_iteration)
-    if arguments.models:
-        seeds = seed_spans(contexts.seeds)
-        _keep_model(arguments.models / row_name(row), folder, arguments.video_model, row, seeds)
-    return row
+    def train(self, trial: SamplerTrial[ClosedLoopPlan], seed: int, on_iteration: OnIteration) -> dict[str, Any]:
+        folder = self.folder()
+        contexts, heldout = self.recordings(folder, trial.plan.eval_contexts)
+        probe = load_probe(shipped_model(TASK), self.where)
+        row = train_arm(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed, on_iteration)
+        if self.models:
+            _keep_model(self.models / row_name(row), folder, self.video_model, row, seed_spans(contexts.seeds))
+        return row
+
+    def pairs(self, rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
+        """Every arm with each control, and with CPS."""
+        names = sorted({row["sampler"] for row in rows})
+        bases = ("CPS 0.4", BEST, RECORDINGS)
+        return [(name, base) for base in bases for name in names if base in names and name != base]
+
+    def show(self, rows: list[dict[str, Any]], comparisons: list[SamplerComparison]) -> None:
+        shown = [name for name in SHOWN if name in rows[0]["evaluations"][0]]  # shorter rollouts have no fourth clip
+        console.print(tables.gain_table(rows, shown), tables.comparison_table(comparisons))
 
 
 def _keep_model(
@@ -199,12 +205,6 @@ def _keep_model(
     save_video_folder(place, folder.codec, folder.network, folder.clip, story)
     for name in (WEIGHTS, SUCCESS_MANIFEST):
         shutil.copyfile(base / name, place / name)
-
-
-def _pairs(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
-    """Every arm with each control, and with CPS."""
-    names = sorted({row["sampler"] for row in rows})
-    return [(name, base) for base in ("CPS 0.4", BEST, RECORDINGS) for name in names if base in names and name != base]
 
 
 def _fill_window(sampler: SamplerSetup) -> SamplerSetup:

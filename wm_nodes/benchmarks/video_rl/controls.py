@@ -13,12 +13,12 @@ from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
 from wm_nodes.config.load import load_video_config
-from wm_nodes.config.video import GrpoConfig
+from wm_nodes.config.video import GrpoConfig, RolloutConfig
 from wm_nodes.core.device import device_of
-from wm_nodes.video_model import RolloutBuffer, RolloutSettings, VideoNetwork, VideoRollout, config_hash
+from wm_nodes.video_model import RolloutBuffer, VideoNetwork, VideoRollout, config_hash, flow_times
 from wm_nodes.video_model.flow_matching import flow_matching_loss
 from wm_nodes.video_rl.grpo import BufferReport, UpdateReport, mixed_reward
-from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts, rollout_settings
+from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
 
 TRAINING_CALLS = 3
 """Forwards that one forward and backward cost."""
@@ -37,7 +37,7 @@ class FlowMatchingLearner:
     """
 
     def __init__(
-        self, model: VideoNetwork, settings: GrpoConfig, rollout: RolloutSettings, *, seed: int, keep: Kept, draws: int
+        self, model: VideoNetwork, settings: GrpoConfig, rollout: RolloutConfig, *, seed: int, keep: Kept, draws: int
     ) -> None:
         if draws % settings.updates_per_buffer:
             raise ValueError(f"{draws} draws cannot be spread over {settings.updates_per_buffer} updates evenly")
@@ -114,11 +114,11 @@ class RecordedTargets(RecordedContexts):
     ) -> RolloutBuffer:
         condition = self.condition(request)
         latents = self.folder.codec.encode(self.references(request).frames)
-        settings, N = rollout_settings(self.config.rollout), len(latents)
+        settings, N = self.config.rollout, len(latents)
         none = latents.new_zeros(N, 0, *latents.shape[1:])
         rollout = VideoRollout(
-            latents, (), (), none, none[:, :, :1], latents.new_zeros(N, 0), None, torch.zeros(N, dtype=torch.int64),
-            latents.new_zeros(0), settings.times,
+            latents, (), (), none, none[:, :, :1], latents.new_zeros(N, 0), none, torch.zeros(N, dtype=torch.int64),
+            latents.new_zeros(0), flow_times(settings.num_steps, settings.shift),
         )
         rows = torch.arange(N)
         return RolloutBuffer(

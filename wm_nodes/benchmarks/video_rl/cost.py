@@ -3,26 +3,28 @@ caching add to a rollout. DD-20.
 """
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from statistics import median
 from typing import Any
 
 import torch
 
+from benchmarks.experiment import Count, OnDevice, console
+from benchmarks.video_rl import tables
 from benchmarks.video_rl.clock import clocked
-from benchmarks.video_rl.samplers import dyndiff, sampler_setup
+from benchmarks.video_rl.discs import base_of
+from benchmarks.video_rl.samplers import LEARNER, dyndiff, sampler_setup
 from benchmarks.video_rl.sources import sample_scenes
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.config.video import Anchor, GrpoConfig
+from wm_nodes.config.video import Anchor, GrpoConfig, RolloutConfig
 from wm_nodes.core.device import device_of, synchronize
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.video_model import (
     Condition,
     RolloutBuffer,
-    RolloutSettings,
-    SamplerSettings,
     VideoNetwork,
     kernels,
     sampling,
@@ -30,8 +32,7 @@ from wm_nodes.video_model import (
 from wm_nodes.video_model.buffer import config_hash
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import GrpoLearner
-from wm_nodes.video_rl.sampling import rollout_settings
-from wm_nodes.video_rl.toy_scene import CHANNELS, FRAMES, SIDE, draw_scenes
+from wm_nodes.video_rl.toy_scene import CHANNELS, FRAMES, SIDE, draw_scenes, load_base
 
 ANCHORS: tuple[Anchor, ...] = ("buffer", "frozen", "dual")
 PARTS = ("forward", "kl", "backward")
@@ -41,8 +42,31 @@ CLIP_FRAMES = 9
 """Of PushCube: every second of the 17 pictures of an episode."""
 
 
+@dataclass(kw_only=True)
+class Cost(OnDevice):
+    """Seconds and bytes of the KL anchors, and of mask and caching."""
+
+    repeats: Count = 7
+    """Turns, of which the median counts."""
+    base_model: Path | None = None
+    """Weights of another base model of the moving disc than the shipped one."""
+    seed: int = 0
+    """Of the buffers."""
+
+    def run(self) -> None:
+        model, repeats, seed = load_base(self.base_model, self.where), self.repeats, self.seed
+        rollouts = [toy_rollout(model, repeats, seed), pushcube_rollout(repeats, seed, self.where)]
+        rows = [
+            *measure_anchors("moving disc", model, toy_buffer(model, seed), LEARNER, repeats),
+            *measure_anchors("PushCube", *pushcube_buffer(seed, self.where), LEARNER, repeats),
+        ]
+        facts = {"seed": seed, "learner": LEARNER.model_dump(), **base_of(self.base_model)}
+        self.write({**facts, "rollouts": rollouts, "rows": rows})
+        console.print(tables.rollout_table(rollouts, repeats), tables.cost_table(rows, repeats))
+
+
 def measure_anchors(
-    name: str, model: VideoNetwork, sampled: tuple[RolloutBuffer, RolloutSettings], learner: GrpoConfig, repeats: int
+    name: str, model: VideoNetwork, sampled: tuple[RolloutBuffer, RolloutConfig], learner: GrpoConfig, repeats: int
 ) -> list[dict[str, Any]]:
     """One row per anchor: median seconds of each part of training on one buffer, turn by turn, and the bytes kept.
 
@@ -58,8 +82,7 @@ def measure_anchors(
             for part in PARTS:
                 times[anchor][part].append(sum(getattr(update, f"{part}_seconds") for update in updates))
     weights = sum(p.nbytes for p in model.parameters())
-    zeta = 0 if buffer.rollout.zeta is None else buffer.rollout.zeta.nbytes
-    kept = {"buffer": zeta + buffer.rollout.mask.nbytes, "frozen": weights}
+    kept = {"buffer": buffer.rollout.zeta.nbytes + buffer.rollout.mask.nbytes, "frozen": weights}
     kept["dual"] = kept["buffer"] + weights
     return [
         {
@@ -71,7 +94,7 @@ def measure_anchors(
 
 
 def measure_rollout(
-    network: VideoNetwork, condition: Condition, shape: tuple[int, ...], rollout: RolloutSettings, repeats: int,
+    network: VideoNetwork, condition: Condition, shape: tuple[int, ...], rollout: RolloutConfig, repeats: int,
     seed: int,
 ) -> dict[str, float]:
     """What the mask and caching add to sampling the videos of `condition`, latents of `shape` (C, F, H, W).
@@ -80,7 +103,7 @@ def measure_rollout(
     turn by turn. mask_share, cache_share: median share of a DynDiff rollout that went into its masks, and into keeping
     states, masks and noise; measured inside that rollout, so the machine's noise moves them less than the ratio.
     """
-    cps = replace(rollout, sampler=SamplerSettings("cps", rollout.sampler.eta))
+    cps = rollout.with_values(sampler=rollout.sampler.with_values(arm="cps"))
     seeds = torch.arange(len(condition.frames)) + seed
     device = device_of(network)
     condition, noise = condition.to(device), sampling.initial_noise(shape, seeds).to(device)
@@ -114,7 +137,7 @@ def toy_rollout(model: VideoNetwork, repeats: int, seed: int) -> dict[str, Any]:
     return {"model": "moving disc", **measure_rollout(model, condition, shape, settings, repeats, seed)}
 
 
-def toy_buffer(model: VideoNetwork, seed: int) -> tuple[RolloutBuffer, RolloutSettings]:
+def toy_buffer(model: VideoNetwork, seed: int) -> tuple[RolloutBuffer, RolloutConfig]:
     """SCENES x GROUP scored videos of the moving disc, DynDiff 0.4 sparse at an rms budget."""
     sampler = sampler_setup("DynDiff", dyndiff(0.4, "sparse", "rms"))
     return sample_scenes(model, sampler, draw_scenes(SCENES, seed, "cost"), GROUP, seed), sampler.rollout
@@ -126,7 +149,7 @@ def pushcube_rollout(repeats: int, seed: int, device: torch.device) -> dict[str,
     return {"model": "PushCube", **measure_rollout(network, condition, shape, rollout, repeats, seed)}
 
 
-def pushcube_buffer(seed: int, device: torch.device) -> tuple[VideoNetwork, tuple[RolloutBuffer, RolloutSettings]]:
+def pushcube_buffer(seed: int, device: torch.device) -> tuple[VideoNetwork, tuple[RolloutBuffer, RolloutConfig]]:
     """The shipped PushCube network and SCENES x GROUP of its videos with random rewards, by the recommended preset."""
     network, condition, shape, rollout = _pushcube(seed, device)
     index = torch.arange(SCENES * GROUP)
@@ -140,7 +163,7 @@ def pushcube_buffer(seed: int, device: torch.device) -> tuple[VideoNetwork, tupl
     return network, (buffer.with_rewards({"total": rewards}), rollout)
 
 
-def _pushcube(seed: int, device: torch.device) -> tuple[VideoNetwork, Condition, tuple[int, ...], RolloutSettings]:
+def _pushcube(seed: int, device: torch.device) -> tuple[VideoNetwork, Condition, tuple[int, ...], RolloutConfig]:
     """The shipped network, what it is asked for, the shape of its latents, and how it samples; given frames and actions
     are random, because times depend on sizes only."""
     config = load_video_config("recommended")
@@ -153,4 +176,4 @@ def _pushcube(seed: int, device: torch.device) -> tuple[VideoNetwork, Condition,
         draw(videos, frames - 1, settings.action_dim), draw(videos, 4, settings.text_dim),
     )
     shape = (settings.channels, frames, H, W)
-    return folder.network.eval(), condition.to(device), shape, rollout_settings(config.rollout)
+    return folder.network.eval(), condition.to(device), shape, config.rollout

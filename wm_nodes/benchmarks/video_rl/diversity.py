@@ -4,6 +4,7 @@ Shapes: n videos of a context, F frames, C channels, H W cells or pixels.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -13,20 +14,27 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from benchmarks.video_rl.samplers import SamplerSetup
-from benchmarks.video_rl.sources import sample_scenes
+from benchmarks.experiment import Count, OnDevice, console
+from benchmarks.video_rl import tables
+from benchmarks.video_rl.discs import base_of
+from benchmarks.video_rl.samplers import SamplerSetup, diversity_samplers
+from benchmarks.video_rl.sources import TASK, recorded_episodes, sample_scenes
+from benchmarks.video_rl.trainings import select, settings_of
+from wm_nodes.config.load import load_video_config
+from wm_nodes.config.seed_ranges import HELDOUT
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.config.video import RolloutConfig
+from wm_nodes.core.progress import tqdm
+from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.statistics import bootstrap_mean
 from wm_nodes.video_model import VideoNetwork
-from wm_nodes.video_rl import frame_features
+from wm_nodes.video_model.clips import load_clips
+from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.diversity import rollout_diversity
-from wm_nodes.video_rl.frame_features import FrameFeatures
-from wm_nodes.video_rl.reference_reward import SEEN_MOTION
+from wm_nodes.video_rl.reference_reward import SEEN_MOTION, load_probe
 from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
-from wm_nodes.video_rl.toy_scene import centred_pixels, draw_scenes, opacity_at
-from wm_nodes.world_model import load_model_folder
-from wm_nodes.world_model.validation.open_loop import OBJECT
+from wm_nodes.video_rl.toy_scene import centred_pixels, draw_scenes, load_base, opacity_at
+from wm_nodes.world_model import Tokenizer, load_model_folder
+from wm_nodes.world_model.positions import columns_of
 
 FEATURES = "centred pixels (each frame less its mean), no learned backbone"
 REACH = 5.0
@@ -35,8 +43,85 @@ QUALITY_BACKGROUND, QUALITY_MASS = 0.10, 0.02
 """Equal quality: background error within 10 % of the other sampler's, mass within 0.02."""
 MARGIN_PX = 4
 """The moving part of a picture reaches this far beyond the pixels that change in the recording."""
+BATCH = 64
+"""Pictures per call of a tokenizer."""
 SPREADS = ("diversity", "diversity_dynamic", "object_spread_cm", "reward_std")
 SCORES = ("tracking", "scenery", "object_cm", "motion")
+
+
+@dataclass(kw_only=True)
+class Diversity(OnDevice):
+    """Diversity of groups of videos, of several samplers."""
+
+    samplers: tuple[str, ...] = ()
+    """Names of those to measure; without, all."""
+    contexts: Count = 100
+    """Groups."""
+    group_size: Count = 8
+    """Videos of each context."""
+    seed: int = 0
+    """Of every random number."""
+
+    def chosen(self) -> list[SamplerSetup]:
+        return select({sampler.name: sampler for sampler in diversity_samplers()}, self.samplers)
+
+    def with_both_noises(self) -> list[SamplerSetup]:
+        """Each sampler with initial noise of every video's own, then each with one that a group shares."""
+        return [replace(setup, shared_noise=shared) for shared in (False, True) for setup in self.chosen()]
+
+
+@dataclass(kw_only=True)
+class DiscDiversity(Diversity):
+    """Diversity on the moving disc, at equal quality and noise budget. DD-19."""
+
+    base_model: Path | None = None
+    """Weights of another base model than the shipped one."""
+
+    def run(self) -> None:
+        model = load_base(self.base_model, self.where)
+        plan = {"contexts": self.contexts, "group_size": self.group_size}
+        rows = [
+            measure_discs(model, setup, **plan, seed=self.seed)
+            for setup in tqdm(self.with_both_noises(), desc="diversity", unit="sampler")
+        ]
+        facts = {"plan": plan, "seed": self.seed, "features": FEATURES, **settings_of(self.chosen())}
+        comparisons = disc_comparisons(rows, self.seed)
+        self.write({**facts, **base_of(self.base_model), "rows": rows, "comparisons": comparisons})
+        console.print(tables.diversity_table(rows, self.seed))
+
+
+@dataclass(kw_only=True)
+class ClipDiversity(Diversity):
+    """Diversity on a video model of recorded episodes; features are those of the world model's frozen tokenizer."""
+
+    context_bags: tuple[Path, ...] = ()
+    """Episodes to take contexts from; without, new ones of seeds that no model has seen."""
+    video_model: Path = shipped_model(TASK) / "video_model"
+    """Folder to sample from."""
+    preset: str = "recommended"
+    """Of the settings of loop 2: a name, or a .yaml."""
+
+    def run(self) -> None:
+        config = load_video_config(self.preset, {"seed": self.seed})
+        folder, probe = load_video_folder(self.video_model, self.where), load_probe(shipped_model(TASK), self.where)
+        bags = self.context_bags or recorded_episodes(self.contexts, HELDOUT)
+        clips = load_clips(bags, folder.clip["stride"])
+        drawn = numpy_stream(self.seed, "clip_diversity").permutation(len(clips))[: self.contexts]
+        contexts = clips.select(torch.from_numpy(drawn))
+        tokenizer = load_model_folder(shipped_model(TASK), self.where).tokenizer
+        setups, rows = self.with_both_noises(), list[dict[str, Any]]()
+        source = RecordedContexts(folder, contexts, config, probe)
+        with tqdm(total=len(setups) * len(contexts), desc="clips", unit="context") as bar:
+            for setup in setups:
+                bar.set_postfix_str(setup.name)
+                rows.append(measure_clips(source, setup, tokenizer, self.group_size, bar.update))
+        compared = clip_comparisons(rows, self.seed)
+        facts = {
+            "contexts": len(contexts), "group_size": self.group_size, "seed": self.seed, "rewards": config.rewards,
+            "features": f"frozen tokenizer of {shipped_model(TASK).name}", "sha256": folder.manifest["sha256"],
+        }
+        self.write({**facts, **settings_of(self.chosen()), "rows": rows, "comparisons": compared})
+        console.print(tables.clip_table(rows, self.seed), tables.clip_comparison_table(compared))
 
 
 def measure_discs(
@@ -62,7 +147,7 @@ def measure_discs(
 
 
 def measure_clips(
-    source: RecordedContexts, sampler: SamplerSetup, features: FrameFeatures, group_size: int,
+    source: RecordedContexts, sampler: SamplerSetup, tokenizer: Tokenizer, group_size: int,
     on_context: Callable[[], Any] = lambda: None,
 ) -> dict[str, Any]:
     """Sample a group of each context with the sampler; lists of one value per context.
@@ -70,8 +155,7 @@ def measure_clips(
     diversity, diversity_dynamic: DD-19 of whole pictures, and of what moves in the recording. object_spread_cm: rms
     distance of the last frames' object positions from their mean. reward, reward_std: of source.config.rewards.
     """
-    rollout = RolloutConfig.model_validate(sampler.rollout, from_attributes=True)
-    rollout = rollout.with_values(micro_batch=source.config.rollout.micro_batch)
+    rollout = sampler.rollout.with_values(micro_batch=source.config.rollout.micro_batch)
     config = source.config.with_values(rollout=rollout)
     source = RecordedContexts(source.folder, source.contexts, config, source.probe)
     found: dict[str, list[float]] = {}
@@ -79,11 +163,11 @@ def measure_clips(
         request = GroupRequest((index,), group_size, index, 0, sampler.shared_noise)
         buffer = source.score(request, source.sample(request))
         frames, K = source.folder.codec.decode(buffer.rollout.latents), buffer.condition.num_conditioning
-        last = source.probe.read(frames[:, -1:])[:, 0][..., OBJECT]
+        last = source.probe.read(frames[:, -1:])[:, 0][..., columns_of(source.contexts.task, "object")]
         moving = moving_part(source.contexts.frames[index]).to(frames.device)
         values = {
-            "diversity": group_diversity(frames[:, K:], features),
-            "diversity_dynamic": group_diversity(frames[:, K:] * moving, features),
+            "diversity": group_diversity(frames[:, K:], tokenizer),
+            "diversity_dynamic": group_diversity(frames[:, K:] * moving, tokenizer),
             "object_spread_cm": 100 * float(np.sqrt(((last - last.mean(0)) ** 2).sum(-1).mean())),
             "reward": float(buffer.rewards["total"].mean()),
             "reward_std": float(buffer.rewards["total"].std(correction=0)),
@@ -93,25 +177,21 @@ def measure_clips(
         for name, value in values.items():
             found.setdefault(name, []).append(value)
         on_context()
-    return {**_named(sampler), "features": features.name, **found}
+    return {**_named(sampler), **found}
 
 
-def load_features(name: str, task: str, device: torch.device) -> FrameFeatures:
-    """Frame features by name, on `device`: pixels, random, tokenizer (of the task's shipped world model), or the folder
-    of a backbone."""
-    if name == "pixels":
-        return frame_features.CentredPixels()
-    if name == "random":
-        return frame_features.RandomFeatures()
-    if name == "tokenizer":
-        folder = shipped_model(task)
-        return frame_features.TokenizerFeatures(load_model_folder(folder, device).tokenizer, folder.name)
-    return frame_features.load_backbone(Path(name), device)
-
-
-def group_diversity(frames: Tensor, features: FrameFeatures) -> float:
+def group_diversity(frames: Tensor, tokenizer: Tokenizer) -> float:
     """DD-19 of uint8 videos (n, F, H, W, 3)."""
-    return rollout_diversity(features(frames.flatten(0, 1)).view(*frames.shape[:2], -1))
+    features = frame_features(frames.flatten(0, 1), tokenizer)
+    return rollout_diversity(features.view(*frames.shape[:2], -1))
+
+
+@torch.no_grad()
+def frame_features(frames: Tensor, tokenizer: Tokenizer) -> Tensor:
+    """Encoder output of uint8 pictures (N, H, W, 3) less its mean over the picture, (N, D)."""
+    parts = torch.split(frames, BATCH)  # type: ignore[no-untyped-call]
+    tokens = torch.cat([tokenizer.features(tokenizer.to_pixels(part)) for part in parts])
+    return (tokens - tokens.mean(1, keepdim=True)).flatten(1)
 
 
 def moving_part(frames: Tensor) -> Tensor:

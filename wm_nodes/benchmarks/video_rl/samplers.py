@@ -1,17 +1,18 @@
 """The competing samplers of the DynDiff benchmark, by name; everything else of a run is shared by all samplers."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 from wm_nodes.config.load import load_video_config
-from wm_nodes.config.video import GrpoConfig, WindowConfig
-from wm_nodes.video_model import MaskSettings, RolloutSettings, SamplerSettings
+from wm_nodes.config.video import GrpoConfig, RolloutConfig, SamplerConfig, WindowConfig
 from wm_nodes.video_rl.toy_scene import SIDE
 
 NUM_STEPS, CLIP_STEPS, SHIFT = 10, 4, 3.0
 NFT_RATE = 2e-4
 """Learning rate of the objective nft on the moving disc, the better one of 1e-4 and 2e-4 on seed 0."""
 BASE = load_video_config("base")
+LEARNER = BASE.grpo.with_values(learning_rate=1e-4, micro_batch=64)
+"""Table 5's clip, advantage clip, KL and step fraction; a learning rate for 76 k parameters instead of billions."""
 CLIP_LEARNER = BASE.grpo.with_values(
     advantage=BASE.grpo.advantage.with_values(std_scope="global", best_of_n=4),
     kl=BASE.grpo.kl.with_values(mode="none"), trains="condition", logprob_weight="cps", updates_per_buffer=1,
@@ -23,55 +24,77 @@ clips of few steps, only the weights that carry the condition, no KL."""
 
 @dataclass(frozen=True)
 class LearningPlan:
-    """iterations: buffers of contexts x group_size videos. eval_contexts: held out, one video each by ODE, before,
-    every eval_every buffers, and at the end."""
+    """How long one training is, and how it is measured."""
 
     iterations: int = 8
+    """Buffers of contexts x group_size videos."""
     contexts: int = 16
+    """Of a buffer."""
     group_size: int = 8
+    """Videos of each context."""
     eval_contexts: int = 100
+    """Held out, one video each by ODE, before, every eval_every buffers, and at the end."""
     eval_every: int = 2
+    """Buffers."""
 
 
 @dataclass(frozen=True)
 class DiscPlan(LearningPlan):
-    """Of the moving disc. proxy: the score that trains, `reward` or one that can be hacked. side, eval_side: of the
-    videos that train and the held-out ones, px."""
+    """Of the moving disc."""
 
     iterations: int = 40
+    """Buffers."""
     contexts: int = 6
+    """Scenes of a buffer."""
     eval_every: int = 5
+    """Buffers."""
     proxy: Literal["reward", "consistency"] = "reward"
+    """The score that trains, `reward` or one that can be hacked."""
     side: int = SIDE
+    """Of the videos that train, px."""
     eval_side: int = SIDE
+    """Of the held-out ones, px."""
 
 
 @dataclass(frozen=True)
 class SamplerSetup:
-    """One sampler with the learner settings that belong to it. shared_noise: one initial noise for a whole group.
-    window: which of its steps are stochastic."""
+    """One sampler with the learner settings that belong to it."""
 
     name: str
-    rollout: RolloutSettings
+    """In the results."""
+    rollout: RolloutConfig
+    """How it samples."""
     grpo: GrpoConfig
+    """How it is trained."""
     shared_noise: bool = False
+    """One initial noise for a whole group."""
     window: WindowConfig = BASE.window
+    """Which of its steps are stochastic."""
 
 
-def sampler_setup(name: str, sampler: SamplerSettings, grpo: GrpoConfig | None = None) -> SamplerSetup:
-    return SamplerSetup(name, RolloutSettings(NUM_STEPS, SHIFT, sampler=sampler, micro_batch=64), grpo or BASE.grpo)
+def sampler_setup(name: str, sampler: SamplerConfig, grpo: GrpoConfig | None = None) -> SamplerSetup:
+    return SamplerSetup(name, rollout_by(sampler, num_steps=NUM_STEPS, micro_batch=64), grpo or BASE.grpo)
 
 
-def dyndiff(eta: float, combine: str = "gated", budget: str = "literal", **knobs: object) -> SamplerSettings:
-    mask = MaskSettings(combine=combine, budget=budget, **knobs)  # type: ignore[arg-type]
-    return SamplerSettings("dyndiff", eta, mask=mask)
+def rollout_by(sampler: SamplerConfig, **changes: Any) -> RolloutConfig:
+    """The base preset's, of CLIP_STEPS steps of SHIFT but for changes."""
+    return BASE.rollout.with_values(**{"num_steps": CLIP_STEPS, "shift": SHIFT, "sampler": sampler, **changes})
+
+
+def by_arm(arm: str, eta: float) -> SamplerConfig:
+    return BASE.rollout.sampler.with_values(arm=arm, eta=eta)
+
+
+def dyndiff(eta: float, combine: str = "gated", budget: str = "literal") -> SamplerConfig:
+    mask = BASE.rollout.sampler.mask.with_values(combine=combine, budget=budget)
+    return BASE.rollout.sampler.with_values(arm="dyndiff", eta=eta, mask=mask)
 
 
 def diversity_samplers() -> list[SamplerSetup]:
     """For diversity: ODE, CPS at several noise levels, DynDiff's literal mask, sparse, and at CPS's noise budget."""
     return [
-        sampler_setup("ODE", SamplerSettings("ode", 0.0)),
-        *(sampler_setup(f"CPS {eta:g}", SamplerSettings("cps", eta)) for eta in (0.2, 0.4, 0.6)),
+        sampler_setup("ODE", by_arm("ode", 0.0)),
+        *(sampler_setup(f"CPS {eta:g}", by_arm("cps", eta)) for eta in (0.2, 0.4, 0.6)),
         *(sampler_setup(f"DynDiff {eta:g} gated", dyndiff(eta)) for eta in (0.6, 1.0)),
         sampler_setup("DynDiff 0.6 sparse", dyndiff(0.6, "sparse")),
         *(
@@ -94,21 +117,21 @@ def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
     )
     cps = learner.with_values(logprob_weight="cps")
     frozen = BASE.grpo.kl.with_values(beta=learner.kl.beta, anchor="frozen")
-    plain = sampler_setup("CPS 0.6", SamplerSettings("cps", 0.6), cps)
+    plain = sampler_setup("CPS 0.6", by_arm("cps", 0.6), cps)
     matched = sampler_setup("DynDiff 0.4 sparse, rms, cps", dyndiff(0.4, "sparse", "rms"), cps)
     sparse = sampler_setup("DynDiff 0.6 sparse, cps", dyndiff(0.6, "sparse"), cps)
     gated = sampler_setup("DynDiff 0.6 gated, rms, cps", dyndiff(0.6, "gated", "rms"), cps)
     quiet = [
-        sampler_setup("CPS 0.46", SamplerSettings("cps", 0.46), cps),  # spends what DynDiff 0.6 gated, rms does
-        sampler_setup("CPS 0.2", SamplerSettings("cps", 0.2), cps),
+        sampler_setup("CPS 0.46", by_arm("cps", 0.46), cps),  # spends what DynDiff 0.6 gated, rms does
+        sampler_setup("CPS 0.2", by_arm("cps", 0.2), cps),
         sampler_setup("DynDiff 0.2 sparse, rms, cps", dyndiff(0.2, "sparse", "rms"), cps),
     ]
-    flow = sampler_setup("Flow-GRPO 0.7", SamplerSettings("flow", 0.7), learner)
+    flow = sampler_setup("Flow-GRPO 0.7", by_arm("flow", 0.7), learner)
     return [
-        plain, sampler_setup("CPS 0.6, full", SamplerSettings("cps", 0.6), learner),
+        plain, sampler_setup("CPS 0.6, full", by_arm("cps", 0.6), learner),
         flow, replace(_in_window(flow), name="Mix-GRPO 0.7"),
-        sampler_setup("DanceGRPO 0.3", SamplerSettings("dance", 0.3), learner),
-        sampler_setup("SAGE 0.5", SamplerSettings("sage", 0.5), learner),
+        sampler_setup("DanceGRPO 0.3", by_arm("dance", 0.3), learner),
+        sampler_setup("SAGE 0.5", by_arm("sage", 0.5), learner),
         sampler_setup("DynDiff 0.6 gated", dyndiff(0.6), learner),
         sampler_setup("DynDiff 0.6 sparse", dyndiff(0.6, "sparse"), learner),
         sampler_setup("DynDiff 0.4 sparse, rms", dyndiff(0.4, "sparse", "rms"), learner),
@@ -119,8 +142,8 @@ def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
             for sampler in (plain, matched, sparse, gated, *quiet)
         ),
         *(replace(_in_window(sampler), name=f"{sampler.name}, window") for sampler in (plain, gated)),
-        sampler_setup("signed FM, ODE", SamplerSettings("ode", 0.0), nft),
-        sampler_setup("signed FM, CPS 0.6", SamplerSettings("cps", 0.6), nft),
+        sampler_setup("signed FM, ODE", by_arm("ode", 0.0), nft),
+        sampler_setup("signed FM, CPS 0.6", by_arm("cps", 0.6), nft),
     ]
 
 
@@ -128,11 +151,11 @@ def clip_learning_samplers() -> list[SamplerSetup]:
     """Claim B on recorded contexts: CPS and DynDiff at one eta, CPS at the noise that DynDiff spends there, and DynDiff
     with its literal mask."""
     samplers = {
-        "CPS 0.6": SamplerSettings("cps", 0.6), "CPS 0.4": SamplerSettings("cps", 0.4),
+        "CPS 0.6": by_arm("cps", 0.6), "CPS 0.4": by_arm("cps", 0.4),
         "DynDiff 0.6 gated, rms": dyndiff(0.6, "gated", "rms"), "DynDiff 0.6 gated": dyndiff(0.6),
     }
     return [
-        SamplerSetup(name, RolloutSettings(CLIP_STEPS, SHIFT, sampler=sampler), CLIP_LEARNER, shared_noise=True)
+        SamplerSetup(name, rollout_by(sampler), CLIP_LEARNER, shared_noise=True)
         for name, sampler in samplers.items()
     ]
 
@@ -143,15 +166,15 @@ def outcome_samplers(preset: str = "outcome") -> list[SamplerSetup]:
     update on a buffer that is flow matching with signed weights ("signed FM"), not the paper's DiffusionNFT."""
     learner = load_video_config(preset).grpo
     samplers = {
-        "CPS 0.4": SamplerSettings("cps", 0.4), "DynDiff 0.54 gated, rms": dyndiff(0.54, "gated", "rms"),
+        "CPS 0.4": by_arm("cps", 0.4), "DynDiff 0.54 gated, rms": dyndiff(0.54, "gated", "rms"),
         "DynDiff 0.6 gated": dyndiff(0.6),
     }
     plain = [
-        SamplerSetup(name, RolloutSettings(CLIP_STEPS, SHIFT, sampler=sampler), learner, shared_noise=True)
+        SamplerSetup(name, rollout_by(sampler), learner, shared_noise=True)
         for name, sampler in samplers.items()
     ]
     windows = [replace(_in_window(sampler, size=2, period=1), name=f"{sampler.name}, window") for sampler in plain[:2]]
-    ode = RolloutSettings(CLIP_STEPS, SHIFT, sampler=SamplerSettings("ode", 0.0))
+    ode = rollout_by(by_arm("ode", 0.0))
     nft = learner.with_values(objective="nft", nft=learner.nft.with_values(times=CLIP_STEPS - 1))
     return [*plain, *windows, SamplerSetup("signed FM, ODE", ode, nft)]
 

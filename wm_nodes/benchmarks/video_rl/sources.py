@@ -5,11 +5,14 @@ Shapes: N videos of one buffer, in groups of one context each.
 
 import math
 from collections.abc import Mapping
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
 from benchmarks.video_rl.samplers import DiscPlan, LearningPlan, SamplerSetup
-from wm_nodes.config.load import load_video_config
-from wm_nodes.config.video import RolloutConfig, VideoRlConfig
+from wm_nodes.config.load import load_config, load_video_config
+from wm_nodes.config.seed_ranges import SeedRange
+from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.environments.record import collect_plan, scripted_plan
 from wm_nodes.video_model import RolloutBuffer, VideoNetwork
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
@@ -22,6 +25,7 @@ from wm_nodes.video_rl.validation import context_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
 TASK = "push_cube"
+EPISODES = Path("runs/clip_contexts")
 REWARDS = {"tracking": 1.0, "object_cm": -0.1}
 """Of recorded contexts."""
 
@@ -86,9 +90,22 @@ def config_of(
     )
     return base.with_values(
         seed=seed, groups=groups, window=sampler.window, grpo=sampler.grpo,
-        rollout=RolloutConfig.model_validate(sampler.rollout, from_attributes=True),
+        rollout=sampler.rollout,
         evaluation=base.evaluation.with_values(contexts=plan.eval_contexts, num_steps=sampler.rollout.num_steps),
     )
+
+
+def recorded_episodes(
+    clips: int, seeds: SeedRange, task: str = TASK, changes: Mapping[str, Any] | None = None
+) -> list[Path]:
+    """Bags of scripted episodes, a tenth more than the clips that are wanted: one that ends early gives none.
+
+    changes: of the simulator's settings.
+    """
+    scene = load_config("cpu", {"task": task, **(changes or {})})
+    plan = scripted_plan(scene, math.ceil(1.1 * clips), seeds)
+    suffix = "".join(f"_{value}" for value in (changes or {}).values())
+    return collect_plan(plan, scene, EPISODES / f"{task}_{plan.first_seed}_{plan.num_episodes}{suffix}")
 
 
 def sample_scenes(

@@ -11,9 +11,7 @@ from benchmarks.video_rl.learning import alarms
 from wm_nodes.core.statistics import bootstrap_mean
 from wm_nodes.reports.console_table import estimate, make_table
 
-COURSE = ("noise_share", "rollout_diversity")
 SCORES = ("tracking", "object_cm", "tool_cm", "psnr_db")
-LAST_UPDATE = ("clip_low_share_2", "clip_high_share_2", "kl_2")
 
 
 def diversity_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
@@ -28,7 +26,7 @@ def diversity_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
 def clip_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
     shown = ("diversity_dynamic", "object_spread_cm", "reward_std", "tracking", "scenery")
     return _table(
-        f"clips of recorded contexts, {rows[0]['features']}; means over contexts", ("sampler", "initial noise"),
+        "clips of recorded contexts, by tokens; means over contexts", ("sampler", "initial noise"),
         ("noise rms/s", "diversity (DD-19)", "moving part", "object spread, cm", "reward std", "tracking", "scenery"),
         (_diversity_cells(row, seed, ".4f", shown) for row in rows),
     )
@@ -56,38 +54,13 @@ def clip_comparison_table(comparisons: Sequence[dict[str, Any]]) -> Table:
     )
 
 
-def training_table(rows: Sequence[dict[str, Any]]) -> Table:
-    """One line per sampler, means over its seeds.
-
-    Held-out scenes before and after; noise and diversity of the sampler's rollouts, means over the buffers; the last
-    second update of the last buffer that was not skipped.
-    """
-    cells = []
-    for sampler in dict.fromkeys(row["sampler"] for row in rows):
-        mine = [row for row in rows if row["sampler"] == sampler]
-        first, last = ([row["evaluations"][i] for row in mine] for i in (0, -1))
-        low, high, kl = (np.mean([_last(row["buffers"][name]) for row in mine]) for name in LAST_UPDATE)
-        cells.append((
-            sampler, len(mine),
-            *(f"{_mean(first, name):.3f} -> {_mean(last, name):.3f}" for name in ("reward", "obeyed")),
-            f"{_mean(last, 'background'):.4f}", f"{_mean(last, 'mass'):.3f}",
-            *(_over_buffers(mine, name) for name in COURSE), f"{low:.2f}/{high:.2f}", f"{kl:.1e}",
-            f"{np.mean([sum(row['seconds'].values()) for row in mine]):.0f}",
-        ))
-    return _table(
-        "held-out scenes, ODE, before and after; mean over seeds", ("sampler",),
-        ("seeds", "reward", "obeyed", "bg", "mass", "noise", "diversity", "clip low/high @2", "KL @2", "seconds"),
-        cells,
-    )
-
-
 def clip_training_table(rows: Sequence[dict[str, Any]]) -> Table:
     """One line per training: held-out contexts after - before, paired over them."""
     cells = []
     for row in rows:
         changes = (np.subtract(row["after"][name], row["before"][name]) for name in SCORES)
         cells.append((
-            row["sampler"], row["seed"], _over_buffers([row], "noise_share"),
+            row["sampler"], row["seed"], f"{np.mean(row['buffers']['noise_share']):.3f}",
             f"{np.mean(row['before']['tracking']):.3f}",
             *(estimate(bootstrap_mean(change, seed=row["seed"]), "+.3f") for change in changes),
             f"{sum(row['seconds'].values()):.0f}",
@@ -185,21 +158,6 @@ def _table(title: str, words: Sequence[str], numbers: Sequence[str], rows: Any) 
 
 def _regime(row: dict[str, Any]) -> str:
     return "shared" if row["shared_noise"] else "own"
-
-
-def _mean(rows: Sequence[dict[str, Any]], name: str) -> float:
-    return float(np.mean([row[name] for row in rows]))
-
-
-def _last(course: Sequence[float | None]) -> float:
-    """The last value that is known; NaN where none is, of a training whose buffers were all skipped."""
-    return next((value for value in reversed(course) if value is not None), np.nan)
-
-
-def _over_buffers(rows: Sequence[dict[str, Any]], name: str) -> str:
-    """Mean over seeds and buffers; nothing where a file of an earlier version lacks it."""
-    means = [np.mean(row["buffers"][name]) for row in rows if name in row["buffers"]]
-    return f"{np.mean(means):.3f}" if len(means) == len(rows) else ""
 
 
 def _change_text(changes: Sequence[float]) -> str:

@@ -6,10 +6,9 @@ Each ablation is a pair on one learner and one sampler, with equal model calls.
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
-from benchmarks.video_rl.samplers import DiscPlan, LearningPlan, SamplerSetup, dyndiff, sampler_setup
+from benchmarks.video_rl.samplers import DiscPlan, LearningPlan, SamplerSetup, by_arm, dyndiff, sampler_setup
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import GrpoConfig
-from wm_nodes.video_model import SamplerSettings
 
 GUIDANCE = 2.0
 HIGH_SIDE = 20
@@ -35,7 +34,7 @@ def ablation_trials(learner: GrpoConfig, plan: DiscPlan) -> tuple[list[SamplerTr
     groups = replace(plan, contexts=max(1, plan.contexts * plan.group_size // PAPER_GROUP), group_size=PAPER_GROUP)
     half = replace(plan, iterations=max(1, plan.iterations // 2), eval_every=max(1, plan.eval_every // 2))
     high = replace(plan, eval_side=HIGH_SIDE)
-    guided, plain = replace(base.rollout, cfg=GUIDANCE), load_video_config("base").grpo
+    guided, plain = base.rollout.with_values(cfg=GUIDANCE), load_video_config("base").grpo
     wide = plain.advantage.with_values(clip=5.0)
     other_kl = plain.kl.with_values(mode="logk2", beta=learner.kl.beta)
     trials = [
@@ -59,7 +58,7 @@ def hacking_trials(learner: GrpoConfig, plan: DiscPlan) -> list[SamplerTrial[Dis
     """The honest reward; temporal consistency alone, which a picture that stands still, or has no disc, satisfies best;
     the same with a frozen anchor, which holds it back."""
     cps = learner.with_values(logprob_weight="cps", learning_rate=SHORT_RATE)
-    sampler = replace(sampler_setup("honest reward", SamplerSettings("cps", 0.6), cps), shared_noise=True)
+    sampler = replace(sampler_setup("honest reward", by_arm("cps", 0.6), cps), shared_noise=True)
     hackable, frozen = replace(plan, proxy="consistency"), learner.kl.with_values(anchor="frozen")
     return [
         SamplerTrial(sampler, plan),

@@ -27,7 +27,7 @@ from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_rl.checks import examine
 from wm_nodes.video_rl.horizons import DRIFT, horizon_scores, measure_headroom
 from wm_nodes.video_rl.reference_reward import load_probe
-from wm_nodes.video_rl.sampling import ClipGenerator, rollout_settings
+from wm_nodes.video_rl.sampling import ClipGenerator
 from wm_nodes.video_rl.toy_scene import CHANNELS, FRAMES, SIDE, draw_scenes, load_base
 
 VIDEOS = 4
@@ -39,7 +39,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--video-model", type=Path, help="folder of an embedded video model; default: the shipped toy")
     parser.add_argument("--context-bags", type=Path, nargs="+", help="bags to take first frames and actions from")
     parser.add_argument("--public", type=Path, help="folder of a public model, diffusers format (Wan, Cosmos-Predict)")
-    parser.add_argument("--prompt", default="a robot arm pushes a cube across the table", help="for a public model")
+    parser.add_argument("--prompt", default="a robot arm pushes a block across the table", help="for a public model")
     parser.add_argument("--text-only", action="store_true", help="give a public model no first frame")
     parser.add_argument("--picture", type=Path, help="first frame for a public model; default: a test card")
     parser.add_argument("--size", type=_size, default=(480, 832), metavar="HxW", help="pixels; default 480x832")
@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     model, condition, shape, config = _model_to_check(arguments, config, recorded)
     videos = config.groups.contexts * config.groups.group_size
     findings = examine(
-        model, condition, shape, rollout_settings(config.rollout), config.grpo, seed=config.seed, buffer_videos=videos
+        model, condition, shape, config.rollout, config.grpo, seed=config.seed, buffer_videos=videos
     )
     title = f"{len(condition.actions)} videos of {' x '.join(map(str, shape))} latents (C x F x H x W)"
     columns = ("check", "", "found", "where it failed")
@@ -130,8 +130,6 @@ def _public(arguments: argparse.Namespace, config: VideoRlConfig, device: str) -
 
     loading = LoadSettings(dtype=arguments.dtype, device=device, offload=arguments.offload)
     public = load_public_model(arguments.public, loading)
-    if public.text is None:
-        raise ValueError(f"{arguments.public} has no text encoder; one is needed to embed the prompt")
     frames = torch.from_numpy(np.stack([_picture(arguments)] * arguments.frames))[None]
     C, F, H, W = public.codec.encode(frames).shape[1:]
     condition = public.condition(frames[:, :1], [arguments.prompt], F).repeat_interleave(VIDEOS)

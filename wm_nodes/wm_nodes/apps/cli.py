@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import inspect
 import io
 import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from wm_nodes.apps.help import asked_page
 from wm_nodes.core.errors import ModelNotAcceptedError, RunError
@@ -54,15 +55,28 @@ GROUPS = {
         "audit": "verify, label, replay and compare the judge's logs",
     },
     "benchmarks, where the repository is": {
-        "benchmark speed": "how fast graph, world model and simulator are; or a GPU (--device)",
-        "benchmark environments": "what models are worth as the environment of a policy",
-        "benchmark video-rl": "DynDiff-GRPO against its rivals",
-        "benchmark judge": "the reward agent under a judge that errs; labelled episodes of others",
+        "benchmark speed": "graph, world model and simulator, side by side",
+        "benchmark device-speed": "what a GPU makes of both loops",
+        "benchmark trained-in": "policies trained in each model, measured in the simulator",
+        "benchmark ranking": "imagined success of policies against their real success",
+        "benchmark disc-base": "the video model that experiments on the moving disc begin with",
+        "benchmark diversity": "diversity on the moving disc, at equal quality and noise budget",
+        "benchmark learning": "reward against model calls, every sampler on one learner",
+        "benchmark ablations": "KL, advantage clip, guidance, resolution, in pairs",
+        "benchmark hacking": "a reward that can be hacked, and what detects it",
+        "benchmark cost": "seconds and bytes of the KL anchors, and of the mask",
+        "benchmark clips": "diversity on a video model of recorded episodes",
+        "benchmark clip-learning": "learning on a video model of recorded episodes",
+        "benchmark resolution": "a video model on larger pictures than it was trained on",
+        "benchmark outcome": "a video model that chooses the motion, by its outcome",
+        "benchmark closed-loop": "a video model that goes on from its own frames, with controls",
+        "benchmark erring": "the reward agent under a judge that errs",
+        "benchmark success-clips": "any judge on other people's labelled episodes",
     },
 }
 VERBS = {name: about for verbs in GROUPS.values() for name, about in verbs.items()}
-"""What each verb does, by its name; `train-policy` is the module wm_nodes.apps.train_policy, `benchmark video-rl` is
-benchmarks.video_rl.cli."""
+"""What each verb does, by its name; `train-policy` is the module wm_nodes.apps.train_policy, `benchmark NAME` an
+experiment of benchmarks.experiment."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -126,15 +140,18 @@ def run_verb(name: str, argv: Sequence[str], program: str) -> int:
 
 def parser_of(name: str, program: str) -> Parser:
     """The parser of a verb, which imports its module. Its arguments' `run` does the verb."""
-    file, experiment = (words.replace("-", "_").replace(" ", "_") for words in (name, name.removeprefix("benchmark ")))
+    group, _, experiment = name.partition(" ")
     with leaving_when_interrupted():
-        module = import_module(f"wm_nodes.apps.{file}" if experiment == file else f"{BENCHMARKS}.{experiment}.cli")
+        verb: Any = (
+            import_module(f"{BENCHMARKS}.experiment").find_experiment(experiment) if group == "benchmark"
+            else import_module(f"wm_nodes.apps.{name.replace('-', '_').replace(' ', '_')}")
+        )
     parser = Parser(
-        prog=program, description=module.__doc__, epilog=EXIT_CODES,
+        prog=program, description=inspect.cleandoc(verb.__doc__), epilog=EXIT_CODES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.set_defaults(run=getattr(module, "run", None))
-    module.add_options(parser)
+    parser.set_defaults(run=verb.start if group == "benchmark" else getattr(verb, "run", None))
+    verb.add_options(parser)
     return parser
 
 

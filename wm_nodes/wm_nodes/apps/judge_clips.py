@@ -3,8 +3,8 @@
     wm judge-clips CLIPS --judge http://host:8000/v1 --judge-model NAME --audit CLIPS/audit
     wm judge-clips CLIPS --judge embedded
 
-A line of clips.jsonl: {"file": "a.mp4", "instruction": "push the red cube into the green target", "task_id":
-"push_cube"}; also clip_id, robot, fps (of a .npy), reference (the picture that the clip had to start from), goal, and
+A line of clips.jsonl: {"file": "a.mp4", "instruction": "push the red bar away from the robot", "task_id":
+"push"}; also clip_id, robot, fps (of a .npy), reference (the picture that the clip had to start from), goal, and
 sha256, which is checked.
 Verdicts are appended to CLIPS/verdicts.jsonl (`accepted`: whether the clip is a success; null where the judge cannot
 tell); started again, it goes on with the clips that this judge, rubric and mode have not judged. A clip that cannot be
@@ -15,7 +15,7 @@ import argparse
 import json
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import closing
 from pathlib import Path
 from statistics import fmean
@@ -26,7 +26,6 @@ from wm_nodes.config.load import judge_or_embedded, load_config
 from wm_nodes.core.progress import tqdm
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.agent.verdict import Verdict
-from wm_nodes.judge.backends.factory import for_task
 from wm_nodes.judge.clip_files import AT_ONCE, read_job, read_list
 from wm_nodes.judge.decisions import accepts
 from wm_nodes.judge.service import ClipJob, JudgeService
@@ -57,22 +56,23 @@ def run(arguments: argparse.Namespace) -> int:
     config, lines = load_config(arguments.config, overrides), read_list(arguments.clips)
     path = arguments.json or arguments.clips / VERDICTS
     settings = judge_or_embedded(config.judge)
-    if first := next((job for line in lines if not (job := read_job(arguments.clips, line)).problem), None):
-        settings = for_task(settings, first.task.task_id)
-    judge = JudgeService(settings, seed=config.seed, reads=arguments.reads, audit=arguments.audit, device=config.device)
+    judge = JudgeService(
+        settings, seed=config.seed, tasks=[line.task_id for line in lines], reads=arguments.reads,
+        audit=arguments.audit, device=config.device,
+    )
     with closing(judge), path.open("a+", encoding="utf-8") as written:
-        asked = {"judge_id": judge.judge_ids[0], "rubric": judge.version}
-        by = {**asked, "mode": settings.mode, "seed": config.seed}
+        by = {"rubric": judge.version, "mode": settings.mode, "seed": config.seed}
+        judges = {task: judge.judge_of(task) for task in {line.task_id for line in lines}}
         written.seek(0)
         before = written.read()
         written.write("" if before.endswith("\n") or not before else "\n")  # after a line that a crash has torn
-        done = _judged_before(before, by)
+        done = _judged_before(before, by, {*judges.values()})
         rows, waiting = list[dict[str, Any]](), list[ClipJob]()
         progress = tqdm(total=len(lines), desc="judged", unit="clip", disable=None)
 
         def flush() -> None:
             for job, verdict in zip(waiting, judge.judge(waiting, round_number=arguments.round), strict=True):
-                rows.append(_row(job, verdict, by))
+                rows.append(_row(job, verdict, by | {"judge_id": judges[job.task.task_id]}))
                 written.write(json.dumps(rows[-1]) + "\n")
             written.flush()
             progress.update(len(waiting))
@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         with progress:
             for job in (read_job(arguments.clips, line) for line in lines):
-                if (known := done.get(_key(job))) is not None:
+                if (known := done.get((_key(job), judges[job.task.task_id]))) is not None:
                     rows.append(known)
                     progress.update()
                     continue
@@ -109,16 +109,20 @@ def _row(job: ClipJob, verdict: Verdict, by: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _judged_before(written: str, by: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Rows by clip and task that the same judge gave; an ERROR is asked again, a torn line is passed over."""
-    found = dict[str, dict[str, Any]]()
+def _judged_before(
+    written: str, by: dict[str, Any], judges: Collection[str]
+) -> dict[tuple[str, str], dict[str, Any]]:
+    """Rows by clip with its task, and judge, that were asked alike; an ERROR is asked again, a torn line is passed
+    over."""
+    found = dict[tuple[str, str], dict[str, Any]]()
     for text in written.removeprefix("\ufeff").split("\n"):
         try:
             row = json.loads(text)
         except ValueError:
             continue
-        if {name: row.get(name) for name in by} == by and row.get("status") != Status.ERROR:
-            found[row["key"]] = row
+        asked = {name: row.get(name) for name in by} == by and row.get("judge_id") in judges
+        if asked and row.get("status") != Status.ERROR:
+            found[row["key"], row["judge_id"]] = row
     return found
 
 

@@ -33,13 +33,12 @@ from wm_nodes.apps.options import add_device, add_json, add_judge, add_seed, dev
 from wm_nodes.config.load import judge_or_embedded, load_config
 from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.agent.types import TaskSpec, clip_ref
-from wm_nodes.judge.backends.factory import for_task
 from wm_nodes.judge.clip_files import LIST, read_job, read_list
 from wm_nodes.judge.hacking.attack import PER_CLIP, Attack
 from wm_nodes.judge.hacking.edits import BENIGN, EDITS, GROSS, PATTERNS, STEPS
 from wm_nodes.judge.hacking.outcomes import Attempt, failures, mildest_step, paid_of
 from wm_nodes.judge.service import ClipJob, JudgeService
-from wm_nodes.recording import read_episodes, read_spec
+from wm_nodes.recording import Bag, read_episodes, read_spec
 from wm_nodes.recording.bag import METADATA
 from wm_nodes.reports.console_table import decimal, make_table, percent, percent_interval
 
@@ -73,9 +72,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise ValueError(f"--limit is a share from 0 to below 1, got {arguments.limit}")
     config = load_config(arguments.config, judge_settings(arguments) | device_settings(arguments))
     settings = judge_or_embedded(config.judge)
-    if first := next((job for job in _jobs(arguments.clips, settings.robot) if not job.problem), None):
-        settings = for_task(settings, first.task.task_id)
-    judge = JudgeService(settings, seed=arguments.seed, reads=arguments.reads, device=config.device)
+    judge = JudgeService(
+        settings, seed=arguments.seed, tasks=_tasks(arguments.clips), reads=arguments.reads, device=config.device
+    )
     with closing(judge):
         attack = Attack(judge, arguments.least, arguments.seed)
         attack.run(_jobs(arguments.clips, settings.robot), arguments.limit_clips)
@@ -83,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
     console = Console()
     if not console.is_terminal:
         console.width = LOG_COLUMNS
-    facts = {"judge": judge.judge_ids[0], "rubric": judge.rubric.version, "mode": settings.mode}
+    facts = {"judge": judge.judge_id, "rubric": judge.rubric.version, "mode": settings.mode}
     caption = f"{facts['judge']}; {attack.paid} clips are paid unedited and attacked, {len(attack.refused)} are not"
     console.print(_edit_table(attempts, caption), _pattern_table(attempts, arguments.limit))
     console.print(*(told or ["this judge holds"]), sep="\n", style="bold", highlight=False)
@@ -97,9 +96,26 @@ def run(arguments: argparse.Namespace) -> int:
     return int(bool(told))
 
 
+def _bags(folder: Path) -> list[Path]:
+    """The bags of a folder without a list of clips."""
+    return [] if (folder / LIST).exists() else sorted(path.parent for path in folder.rglob(METADATA))
+
+
+def _tasks(folder: Path) -> list[str]:
+    """Of the clips. Raises as _jobs."""
+    bags = _bags(folder)
+    if not bags:
+        return [line.task_id for line in read_list(folder)]
+    tasks = list[str]()
+    for path in bags:
+        with Bag(path) as bag:
+            tasks += {str(row["task"]) for row in bag.episode_table()}
+    return tasks
+
+
 def _jobs(folder: Path, robot: str) -> Iterator[ClipJob]:
     """The clips of a list, or the episodes of bags. Raises ValueError: there are none of either. BagError."""
-    bags = [] if (folder / LIST).exists() else sorted(path.parent for path in folder.rglob(METADATA))
+    bags = _bags(folder)
     if not bags:
         yield from (read_job(folder, line) for line in read_list(folder))
     for bag in bags:

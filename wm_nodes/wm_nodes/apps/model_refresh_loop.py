@@ -31,13 +31,14 @@ from wm_nodes.training.metrics import join_metrics
 from wm_nodes.world_model import load_model_folder
 
 RESULT = "result.json"
-Judge = Callable[[BoolArray, BoolArray], None]
-"""(imagined, real success of the starting policy) -> None; may raise to refuse the training."""
+Judge = Callable[[BoolArray, BoolArray | None], None]
+"""(imagined, real success of the starting policy) -> None; may raise to refuse the training. None: not measured."""
 
 
 @dataclass(frozen=True)
 class ModelRefreshLoop:
-    """What a run's rounds gave. Success: bool (E,), before the first round in its model and after the last in its.
+    """What a run's rounds gave. Success: bool (E,), before the first round in its model and after the last in its;
+    real_, None where evaluation.environment is none.
 
     policy: the weights after the last round. model_dir: what it was trained in. samples, samples_per_s: all rounds'
     transitions, and their rate (mean of the rounds). bag: of the last round's training. table: one mapping for each
@@ -46,8 +47,8 @@ class ModelRefreshLoop:
 
     policy: Path
     model_dir: Path
-    real_before: BoolArray
-    real_after: BoolArray
+    real_before: BoolArray | None
+    real_after: BoolArray | None
     imagined_before: BoolArray
     imagined_after: BoolArray
     samples: int
@@ -111,7 +112,8 @@ def run_rounds(
     if table:
         join_metrics([start.folder for start in starts], job.run_dir)
     return ModelRefreshLoop(
-        policy, last.model_dir, read_success(first.folder, "real_before"), read_success(last.folder, "real_after"),
+        policy, last.model_dir, read_success(first.folder, "real_before") if job.measures else None,
+        read_success(last.folder, "real_after") if job.measures else None,
         read_success(first.folder, "imagined_before"), read_success(last.folder, "imagined_after"),
         sum(trained.samples for trained in trainings),
         sum(trained.samples_per_s for trained in trainings) / len(trainings), trainings[-1].bag, tuple(table),

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from wm_nodes.config.environments import NO_ENVIRONMENT
 from wm_nodes.config.load import dump_config
 from wm_nodes.config.saved import with_device
 from wm_nodes.config.schema import RunConfig
@@ -71,6 +72,11 @@ class RunContext:
     verbose: bool = False
     reward: str = "endogenous"
     video_model: str = ""
+
+    @property
+    def measures(self) -> bool:
+        """Whether policies are measured in an environment, and not only in the model."""
+        return self.config.evaluation.environment != NO_ENVIRONMENT
 
     @property
     def trained_in(self) -> str:
@@ -146,12 +152,13 @@ def is_trained(start: TrainingStart) -> bool:
 
 
 def train_round(
-    job: RunContext, start: TrainingStart, judge: Callable[[BoolArray], None] | None = None,
+    job: RunContext, start: TrainingStart, judge: Callable[[BoolArray | None], None] | None = None,
     waiting: WaitingGraph | None = None,
 ) -> TrainingResult:
-    """Train start.policy in start.model_dir and measure it in the simulator; finished parts are kept.
+    """Train start.policy in start.model_dir and measure it in evaluation.environment; finished parts are kept.
 
-    judge: called with the starting policy's real success before any update; may raise to refuse the training.
+    judge: called with the starting policy's real success (None: not measured) before any update; may raise to refuse
+        the training.
     waiting: this training's processes, where they run already; stopped at the end.
     """
     marker = start.folder / TRAINED
@@ -164,7 +171,7 @@ def train_round(
         os.environ.update(runner.environment)
         with GraphClient(alive=runner.check) as operator:
             if judge is not None:
-                judge(_real(operator, job, start, "before", start.policy))
+                judge(_real(operator, job, start, "before", start.policy) if job.measures else None)
             before, began = _progress(start.folder), time.monotonic()
             remaining = max(0, start.config.ppo.updates - int(before["updates"]))
             job.stage(f"training the policy in the {job.trained_in}: {remaining} updates")
@@ -175,7 +182,8 @@ def train_round(
             samples = int(after["samples"]) - int(before["samples"])
             version, updates, total = (int(after[name]) for name in ("version", "updates", "samples"))
             trained = TrainingResult(version, updates, total, samples / seconds, str(waiting.bag), stopped)
-            _real(operator, job, start, "after", trained.policy(start.folder))
+            if job.measures:
+                _real(operator, job, start, "after", trained.policy(start.folder))
     write_atomic(marker, json.dumps(asdict(trained), indent=1).encode())
     return trained
 
@@ -217,6 +225,11 @@ def cached_success(path: Path, identity: Mapping[str, str], measure: Callable[[]
     content = {"identity": dict(identity), "success": success.astype(int).tolist(), "low": rate.low, "high": rate.high}
     write_atomic(path, json.dumps(content).encode())
     return success
+
+
+def measured_rate(success: BoolArray | None) -> SuccessRate | None:
+    """None for what was not measured."""
+    return None if success is None else success_rate(success)
 
 
 def success_rate(success: BoolArray) -> SuccessRate:

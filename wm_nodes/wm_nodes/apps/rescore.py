@@ -156,8 +156,7 @@ def _rescore_clips(arguments: argparse.Namespace) -> tuple[bool, dict[str, Any],
 
 @contextmanager
 def _clip_judge(config: VideoRlConfig, run_dir: Path, contexts: Clips, fps: float) -> Iterator[BufferJudge | None]:
-    """The run's reward agent with the answers that it kept; a round is judged by the judge that did it, where the run
-    still has that one. None where the agent is not among the rewards."""
+    """The run's reward agent with the answers that it kept; None where it is not among the rewards."""
     if not config.rewards.get(AGENT):
         yield None
         return
@@ -166,7 +165,7 @@ def _clip_judge(config: VideoRlConfig, run_dir: Path, contexts: Clips, fps: floa
         jobs = buffer_jobs(
             frames, references, recorded.sha256, config, given=config.model.num_conditioning, fps=fps
         )
-        found = judge.judge(jobs, by=recorded.judge_id if recorded.judge_id in judge.judge_ids else "")
+        found = judge.judge(jobs)
         return JudgedBuffer(agent_scores(found), tuple(verdict_row(verdict) for verdict in found))
 
     settings = for_task(judge_or_embedded(config.judge), config.task)

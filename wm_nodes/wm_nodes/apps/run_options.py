@@ -32,7 +32,7 @@ UNKNOWN_BEFORE = ("preset", "model_dir", "run_folder")
 """Options that folders without begun_with.json do not tell; the others are comments in their config.yaml."""
 OPTION_OF = {
     "seed": "--seed", "task": "--task", "simulation.scenes": "--scenes", "model_refresh.num_rounds": "--rounds",
-    "rewards": "--reward",
+    "rewards": "--reward", "sft.bags": "--demos",
     "judge.kind": "--judge", "judge.endpoints": "--judge", "judge.folder": "--judge", "judge.model": "--judge-model",
     "judge.api_key_env": "--judge-key-env", "judge.rubric": "--rubric",
     "run_folder": "run",

@@ -6,7 +6,7 @@ Every stage leaves its files in the run folder and is skipped when they are ther
 
 import argparse
 import json
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -17,8 +17,9 @@ import numpy as np
 from wm_nodes.apps import options
 from wm_nodes.apps.model_refresh_loop import round_start, run_rounds
 from wm_nodes.apps.policy_pictures import write_pictures
-from wm_nodes.apps.policy_run import RunContext, Stages, console, is_trained, start_graph, success_rate
+from wm_nodes.apps.policy_run import RunContext, Stages, console, is_trained, measured_rate, start_graph, success_rate
 from wm_nodes.apps.run_options import open_run
+from wm_nodes.config.environments import NO_ENVIRONMENT
 from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, load_config, preset_names
 from wm_nodes.config.scenes import SCENES, splits
 from wm_nodes.config.schema import AGENT, RunConfig
@@ -30,7 +31,7 @@ from wm_nodes.core.errors import ModelNotAcceptedError
 from wm_nodes.core.model_folder import AGAIN, MANIFEST, read_json
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import BoolArray
-from wm_nodes.environments.registry import configured_spec
+from wm_nodes.environments.registry import configured_spec, is_simulated, make_environment
 from wm_nodes.judge.backends.factory import judge_name
 from wm_nodes.judge.episode_reward import check_agent, episode_judge
 from wm_nodes.launching.scenarios import IMAGINED
@@ -39,6 +40,7 @@ from wm_nodes.policy_rl.exploit_meter import start_seeds
 from wm_nodes.policy_rl.factories import check_model, load_policy, load_steppable
 from wm_nodes.policy_rl.initial_policy import num_starts, prepare_start, start_files
 from wm_nodes.policy_rl.pretraining import make_model
+from wm_nodes.recording import read_spec
 from wm_nodes.reports.html import write_report
 from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reports.summary import Summary, acceptance_outcome, as_first_made, read_readings, write_summary
@@ -59,7 +61,10 @@ DEFAULTS = {
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_preset(parser, "cpu", preset_names())
-    parser.add_argument("--task", choices=task_names(), help="default: the preset's")
+    parser.add_argument(
+        "--task", choices=("", *task_names()),
+        help='default: the preset\'s; "": none, for an environment of your own, with --model-dir and --demos',
+    )
     parser.add_argument(
         "--scenes", metavar="NAME",
         help=f"where the task has many: {', '.join(splits())}, or one scene such as {next(iter(SCENES))}; "
@@ -68,6 +73,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_seed(parser, None)
     options.add_run_dir(parser)
     parser.add_argument("--model-dir", type=Path, help="world model to use instead of the shipped one")
+    parser.add_argument(
+        "--demos", nargs="+", type=Path, metavar="BAG",
+        help="recordings whose successful episodes the weak policy is cloned from, instead of planned demonstrations",
+    )
     parser.add_argument(
         "--environment", choices=IMAGINED,
         help=f"what the policy is trained in; default: {IMAGINED[0]}, which also gives the policy its encoder",
@@ -101,7 +110,7 @@ def run(arguments: argparse.Namespace) -> None:
 def opened(arguments: argparse.Namespace) -> AbstractContextManager[tuple[RunConfig, Path]]:
     """The run folder of the options, see open_run."""
     return open_run(
-        arguments, "train-policy", name=lambda config: config.task, load=partial(_load, arguments),
+        arguments, "train-policy", name=lambda config: config.task or "policy", load=partial(_load, arguments),
         check=partial(_check, arguments), settings=_settings(arguments), fixed=FIXED, free=FREE, defaults=DEFAULTS,
     )
 
@@ -120,19 +129,20 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
         if not is_trained(first):
             waiting = start_graph(job, first)
             stack.callback(waiting.runner.stop)
-        demos = config.sft.num_demonstrations
-        stage(f"{demos} MPLib demonstrations, first frames, and the weak policy cloned from them")
+        demos = f"{config.sft.num_demonstrations} {'recorded' if config.sft.bags else 'MPLib'} demonstrations"
+        stage(f"{demos}, first frames, and the weak policy cloned from them")
         prepare_start(config, run_dir, model_dir)
         if config.exploit_meter.every:
             _check_meter(config, starts, stage)
         found = run_rounds(job, model_dir, weak, partial(_judge, job, model_dir, arguments.force), waiting)
     summary = as_first_made(run_dir, Summary(
-        task=config.task, preset=arguments.preset, seed=config.seed,
-        real_before=success_rate(found.real_before), real_after=success_rate(found.real_after),
+        task=config.task or model_spec(model_dir, read_world_manifest(model_dir)).task,
+        preset=arguments.preset, seed=config.seed,
+        real_before=measured_rate(found.real_before), real_after=measured_rate(found.real_after),
         imagined_before=success_rate(found.imagined_before), imagined_after=success_rate(found.imagined_after),
         imagined_steps_per_s=found.samples_per_s, bag=found.bag,
-        paired=asdict(paired_difference(found.real_before.tolist(), found.real_after.tolist())),
-        imagined_paired=asdict(paired_difference(found.imagined_before.tolist(), found.imagined_after.tolist())),
+        paired=_paired(found.real_before, found.real_after),
+        imagined_paired=_paired(found.imagined_before, found.imagined_after),
         acceptance=_read_acceptance(run_dir), samples=found.samples, minutes=stage.minutes,
         command=arguments.command, machine=machine_facts(config.device), rounds=found.table, reward=arguments.reward,
         exploit_meter=read_readings(run_dir), stopped=found.stopped,
@@ -141,7 +151,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
     ))
     write_summary(run_dir, summary)
     policy = load_policy(config, found.model_dir, found.policy)
-    pictures = write_pictures(run_dir, config, found.model_dir, policy, HELDOUT.first)
+    pictures = write_pictures(run_dir, config, found.model_dir, policy, HELDOUT.first) if is_simulated(config) else []
     report = write_report(run_dir, summary, pictures, config_text=dump_config(config))
     if summary.rounds:
         console.print(rounds_table(summary))
@@ -154,17 +164,24 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
     console.print(f"report   {report}\nsummary  {run_dir / 'summary.json'}\nbag      {summary.bag}", highlight=False)
 
 
-def _by_task(config: RunConfig, before: BoolArray, after: BoolArray) -> dict[str, dict[str, Any]]:
+def _paired(before: BoolArray | None, after: BoolArray | None) -> dict[str, Any]:
+    """Summary.paired of two evaluations in seed order."""
+    if before is None or after is None:
+        return {}
+    return asdict(paired_difference(before.tolist(), after.tolist()))
+
+
+def _by_task(config: RunConfig, before: BoolArray | None, after: BoolArray | None) -> dict[str, dict[str, Any]]:
     """Summary.by_task of two evaluations in seed order."""
     parts, first = parts_of(config.task), config.evaluation.first_seed
-    if len(parts) == 1:
+    if len(parts) == 1 or before is None or after is None:
         return {}
     tasks = np.array([part_of(config.task, first + episode) for episode in range(len(before))])
     pairs = {part: (before[tasks == part], after[tasks == part]) for part in parts if part in tasks}
     return {
         part: {
             "successes_before": int(old.sum()), "successes_after": int(new.sum()),
-            **asdict(paired_difference(old.tolist(), new.tolist())),
+            **_paired(old, new),
         }
         for part, (old, new) in pairs.items()
     }
@@ -172,7 +189,8 @@ def _by_task(config: RunConfig, before: BoolArray, after: BoolArray) -> dict[str
 
 def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
     chosen = options.settings(arguments) | options.judge_settings(arguments)
-    chosen |= {"task": arguments.task} if arguments.task else {}
+    chosen |= {} if arguments.task is None else {"task": arguments.task}
+    chosen |= {"sft.bags": [str(bag.expanduser().absolute()) for bag in arguments.demos]} if arguments.demos else {}
     chosen |= {"simulation.scenes": arguments.scenes} if arguments.scenes else {}
     return chosen | ({} if arguments.rounds is None else {"model_refresh.num_rounds": arguments.rounds})
 
@@ -186,9 +204,16 @@ def _check(arguments: argparse.Namespace, config: RunConfig) -> None:
     compute_device(config.device)
     if arguments.model_dir and not Path(arguments.model_dir, MANIFEST).is_file():
         raise ConfigError(f"{arguments.model_dir} holds no {MANIFEST}; name the folder of a trained world model")
-    if not arguments.from_scratch:
+    if not config.task:
+        _check_without_task(arguments, config)
+    elif not arguments.from_scratch:
         model_dir = Path(arguments.model_dir or shipped_model(config.task))
         check_model(configured_spec(config), model_dir, model_spec(model_dir, read_world_manifest(model_dir)))
+    for bag in config.sft.bags:
+        read_spec(Path(bag))
+    if config.model_refresh.num_rounds > 1 and not is_simulated(config):
+        raise ConfigError(f"--rounds {config.model_refresh.num_rounds} collect in the simulator; give 1, or a task and "
+                          "evaluation.environment maniskill")
     _check_environment(arguments, config)
     if config.exploit_meter.every and config.exploit_meter.episodes > num_starts(config):
         raise ConfigError(f"exploit_meter.episodes is {config.exploit_meter.episodes}, and this run has "
@@ -198,6 +223,23 @@ def _check(arguments: argparse.Namespace, config: RunConfig) -> None:
         raise ConfigError(f"{', '.join(judge)} would change nothing without --reward agent")
     if arguments.reward == AGENT:
         check_agent(config)
+
+
+def _check_without_task(arguments: argparse.Namespace, config: RunConfig) -> None:
+    """Everything that the simulator gives has to come from elsewhere, and to fit the model."""
+    for missing, remedy in (
+        (not arguments.model_dir, "name a model of your recordings with --model-dir"),
+        (not config.sft.bags, "name recordings of demonstrations with --demos"),
+        (arguments.from_scratch, "leave --from-scratch out: it collects in the simulator"),
+        (arguments.video_model, "leave --video-model out: it is of a task"),
+        (config.exploit_meter.every, "set exploit_meter.every to 0: it replays in the simulator"),
+    ):
+        if missing:
+            raise ConfigError(f"task is empty; {remedy}")
+    if (name := config.evaluation.environment) != NO_ENVIRONMENT:
+        model_dir = Path(arguments.model_dir)
+        with closing(make_environment(config, name, num_envs=1, seed=config.seed)) as environment:
+            check_model(environment.spec, model_dir, model_spec(model_dir, read_world_manifest(model_dir)))
 
 
 def _check_environment(arguments: argparse.Namespace, config: RunConfig) -> None:
@@ -226,11 +268,11 @@ def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stag
     return Path(model_dir).expanduser().absolute()
 
 
-def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, real: BoolArray) -> None:
+def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, real: BoolArray | None) -> None:
     """Write acceptance.json and print it; raise ModelNotAcceptedError where the model failed and `force` is not set. A
     model about which too few episodes decide nothing is trained in, and the run says so."""
     config = job.config
-    successes = (int(imagined.sum()), len(imagined)), (int(real.sum()), len(real))
+    successes = (int(imagined.sum()), len(imagined)), None if real is None else (int(real.sum()), len(real))
     report = accept_model(
         config, model_dir, load_policy(config, model_dir, start_files(job.run_dir)[1]), *successes,
         job.run_dir / "bags" / "heldout", video_model_dir=Path(job.video_model) if job.video_model else None,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import os
 import pkgutil
 from typing import TypeVar
@@ -10,28 +11,42 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
-def find_files(what: str, package: str, variable: str) -> dict[str, str]:
-    """Package by file name, of our package and of those that an environment variable names, separated by commas.
+ROOM = "wm_nodes.environments"
+
+
+def find_files(kind: str, folder: str, variable: str) -> dict[str, str]:
+    """Package by file name, of our packages and of those packages and single modules that an environment variable
+    names, separated by commas.
 
     Args:
-        what: a file defines, for errors.
+        kind: what a file defines, for errors.
+        folder: name of our packages, each in a package of ROOM.
 
     Raises:
         ValueError: a package is missing, or two have the same file.
     """
     packages: dict[str, str] = {}
-    for name in (package, *filter(None, (part.strip() for part in os.environ.get(variable, "").split(",")))):
-        try:
-            folders = importlib.import_module(name).__path__
-        except (ModuleNotFoundError, AttributeError) as error:
-            raise ValueError(f"{variable} names {name!r}, no package that Python finds; see PYTHONPATH") from error
-        for module in pkgutil.iter_modules(folders):
-            if module.name.startswith("_"):
-                continue
-            if module.name in packages:
-                raise ValueError(f"{what} {module.name!r} is in {packages[module.name]} and in {name}; rename one")
-            packages[module.name] = name
+    named = filter(None, (part.strip() for part in os.environ.get(variable, "").split(",")))
+    for name in (*_shipped(folder), *named):
+        for parent, module in _modules(name, variable):
+            if module in packages:
+                raise ValueError(f"{kind} {module!r} is in {packages[module]} and in {parent}; rename one")
+            packages[module] = parent
     return packages
+
+
+def _modules(name: str, variable: str) -> list[tuple[str, str]]:
+    """Package and name of each file that a package holds, or of the one that the name says; none is imported."""
+    try:
+        found = importlib.util.find_spec(name)
+    except ModuleNotFoundError:
+        found = None
+    if found is None:
+        raise ValueError(f"{variable} names {name!r}, no package or module that Python finds; see PYTHONPATH")
+    if found.submodule_search_locations is None:
+        return [(name.rpartition(".")[0], name.rpartition(".")[2])]
+    modules = pkgutil.iter_modules(found.submodule_search_locations)
+    return [(name, module.name) for module in modules if not module.name.startswith("_")]
 
 
 def load_file(name: str, packages: dict[str, str], kind: type[T], guide: str) -> T:
@@ -39,13 +54,19 @@ def load_file(name: str, packages: dict[str, str], kind: type[T], guide: str) ->
 
     Args:
         packages: see find_files.
-        guide: the package that says how to write one, for the error.
+        guide: the module that says how to write one, for the error.
 
     Raises:
         ValueError: the file has no such constant.
     """
-    module = importlib.import_module(f"{packages[name]}.{name}")
+    module = importlib.import_module(".".join(filter(None, (packages[name], name))))
     found = getattr(module, kind.__name__.upper(), None)
     if not isinstance(found, kind):
         raise ValueError(f"{module.__file__} has no {kind.__name__.upper()} = {kind.__name__}(...); see {guide}")
     return found
+
+
+def _shipped(folder: str) -> list[str]:
+    parts = pkgutil.iter_modules(importlib.import_module(ROOM).__path__)
+    names = [f"{ROOM}.{part.name}.{folder}" for part in parts if part.ispkg]
+    return [name for name in names if importlib.util.find_spec(name)]

@@ -20,7 +20,7 @@ from wm_nodes.config.video import VideoRlConfig
 PRESETS = resources.files("wm_nodes.config") / "presets"
 POLICY, VIDEO = "policy", "video"
 """Folders of presets, one for each loop."""
-FREE = ("behaviours", "rewards", "extra_body")
+FREE = ("behaviours", "rewards", "extra_body", "kwargs")
 """Mappings without fixed keys, which are replaced as a whole."""
 FORMER_NAMES = {"gate": "acceptance", "rounds": "model_refresh"}
 """Sections of configurations saved before they were renamed."""
@@ -72,11 +72,6 @@ def _load(schema: type[Config], loop: str, preset: str, overrides: dict[str, Any
         return schema.model_validate(values)
     except ValidationError as error:
         raise refusal(error, f"{schema.__module__.replace('.', '/')}.py", file) from None
-
-
-def default_task() -> str:
-    """The task of base.yaml."""
-    return str(read_preset("base")["task"])
 
 
 def default_judge() -> JudgeConfig:

@@ -4,7 +4,14 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from wm_nodes.config.sections import Fraction, NonNegativeInt, PositiveFloat, PositiveInt, SettingsSection
+from wm_nodes.config.sections import (
+    EnvironmentName,
+    Fraction,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    SettingsSection,
+)
 from wm_nodes.config.seed_ranges import EVALUATION
 
 
@@ -26,7 +33,9 @@ class AcceptanceConfig(SettingsSection):
     object_error_ratio: PositiveFloat
     """Full-horizon object error must be below this share of the error of copying the first frame."""
     tool_error_ratio: PositiveFloat
+    """The same of the tool's error."""
     done_precision: Fraction
+    """Least precision of the done signal."""
     done_recall: Fraction
     """On rollouts of held-out actions, not on real frames, and on rollouts of the cloned policy."""
     clone_episodes: NonNegativeInt = 0
@@ -52,6 +61,7 @@ class ModelRefreshConfig(SettingsSection):
     replay_episodes: PositiveInt
     """Scripted simulator episodes mixed into every refresh, against forgetting."""
     refresh_iterations: PositiveInt
+    """Of a refresh."""
     learning_rate: PositiveFloat
     """Peak learning rate of a refresh."""
     own_starts: Annotated[int, Field(ge=0, le=5000)]
@@ -59,10 +69,14 @@ class ModelRefreshConfig(SettingsSection):
 
 
 class EvaluationConfig(SettingsSection):
+    environment: EnvironmentName
+    """What the policy is measured in, said as environment.factory; none: only what is imagined is measured."""
     episodes: PositiveInt
+    """Per evaluation."""
     first_seed: NonNegativeInt
     """Reset seed of the first evaluation episode; all lie in the range of evaluations, see config/seed_ranges.py."""
     deterministic: bool
+    """The mean action, without exploration noise."""
 
     @model_validator(mode="after")
     def _check_seeds(self) -> Self:

@@ -1,7 +1,8 @@
 """The catalogue of the table-top scenes: which object, container and table, and which scenes train or test.
 
-A scene's name is <colour>_<shape>-<container>-<table>, e.g. red_cube-bowl-grey_table. Every scene of SCENES is in one
-split; scenes.json lists them. Those of a user's own shapes are in none. Standard library only, as tasks.py.
+A scene's name is <colour>_<shape>-<container>-<table>, e.g. red_bar-bowl-grey_table. Every scene of SCENES is in one
+split; scenes.json lists them, and what they are made of. Those of a user's own shapes are in none. Standard library
+only, as tasks.py.
 """
 
 from __future__ import annotations
@@ -16,11 +17,10 @@ from importlib import resources
 
 from wm_nodes.config.extensions import find_files
 
-SHAPES = ("cube", "bar", "cylinder", "sphere", "capsule")
-COLOURS = ("red", "green", "blue", "yellow")
-CONTAINERS = ("plate", "bowl")
-TABLES = ("grey_table", "brown_table")
-SHAPE_FILES = "wm_nodes.environments.maniskill.shapes"
+_CATALOGUE = json.loads(resources.files("wm_nodes.config").joinpath("scenes.json").read_text(encoding="utf-8"))
+COLOURS, SHAPES, CONTAINERS, TABLES = (
+    tuple(_CATALOGUE["parts"][name]) for name in ("colours", "shapes", "containers", "tables")
+)
 SHAPES_VARIABLE = "WM_SHAPES"
 """Environment variable with the names of further packages of shapes, separated by commas."""
 
@@ -30,9 +30,13 @@ class Scene:
     """What lies on the table, and the table."""
 
     colour: str
+    """Of the object."""
     shape: str
+    """Of the object: a file's name."""
     container: str
+    """What lies beside the object."""
     table: str
+    """Its top."""
 
     @property
     def name(self) -> str:
@@ -54,8 +58,7 @@ SCENES = {
 def splits() -> dict[str, tuple[str, ...]]:
     """Names of the scenes by split: train, ood_object (objects that are nowhere else) and ood_combo (objects,
     containers and tables of train in combinations that are not)."""
-    text = resources.files("wm_nodes.config").joinpath("scenes.json").read_text(encoding="utf-8")
-    return {split: tuple(names) for split, names in json.loads(text).items()}
+    return {split: tuple(names) for split, names in _CATALOGUE["splits"].items()}
 
 
 def scenes_of(setting: str) -> tuple[Scene, ...]:
@@ -82,7 +85,7 @@ def scenes_of(setting: str) -> tuple[Scene, ...]:
 
 def shapes() -> dict[str, str]:
     """Package by shape. Raises ValueError as find_files."""
-    return find_files("shape", SHAPE_FILES, SHAPES_VARIABLE)
+    return find_files("shape", "shapes", SHAPES_VARIABLE)
 
 
 def check_scenes(setting: str) -> str:

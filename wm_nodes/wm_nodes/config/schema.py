@@ -5,11 +5,13 @@ Loop 2's are in video.py.
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from wm_nodes.config.environments import EnvironmentConfig, GymnasiumConfig
 from wm_nodes.config.measurement import AcceptanceConfig, EvaluationConfig, ExploitMeterConfig, ModelRefreshConfig
 from wm_nodes.config.scenes import check_scenes
 from wm_nodes.config.sections import (
+    FactoryName,
     Fraction,
     NonNegativeFloat,
     NonNegativeInt,
@@ -22,7 +24,9 @@ from wm_nodes.config.tasks import check_task, instruction
 AGENT = "agent"
 """Name of the reward agent among the rewards of both loops."""
 
-TaskName = Annotated[str, AfterValidator(lambda name: name and check_task(name))]
+TaskName = Annotated[
+    str, BeforeValidator(lambda name: name or ""), AfterValidator(lambda name: name and check_task(name))
+]
 """Name of a task's file, see config/tasks.py. Empty: there is none, and `simulation` is not read; everything follows
 the spec of the environment, of its recordings or of the model that was trained on them."""
 ScenesName = Annotated[str, AfterValidator(check_scenes)]
@@ -172,10 +176,12 @@ class RewardConfig(SettingsSection):
     """The dense reward of one step is clipped to [-dense_clip, dense_clip]."""
     uncertainty_limit: NonNegativeFloat
     """An imagined step above it pays no sparse reward and truncates the episode; 0: off."""
+    factory: FactoryName = ""
+    """module:callable(config) -> RewardModel (reward/base.py) instead of the built-in one; empty: none."""
 
 
-class OtherJudge(SettingsSection):
-    """A further judge; as in JudgeConfig, whose other values it shares."""
+class StageJudge(SettingsSection):
+    """A judge of some stages of every clip; as in JudgeConfig, whose other values it shares."""
 
     kind: Literal["openai", "embedded"] = "openai"
     endpoints: list[str] = Field(default=[])
@@ -183,11 +189,6 @@ class OtherJudge(SettingsSection):
     api_key_env: str = ""
     folder: str = ""
     extra_body: dict[str, Any] = Field(default={})
-
-
-class StageJudge(OtherJudge):
-    """A judge of some stages of every clip."""
-
     stages: Annotated[list[Literal["PLAN", "VQ", "IF", "TC", "PC", "HACK"]], Field(min_length=1)]
 
 
@@ -250,10 +251,6 @@ class JudgeConfig(SettingsSection):
     routes: list[StageJudge]
     """Other judges for some stages, e.g. [{stages: [TC, PC], endpoints: [URL], model: NAME}] beside the embedded one. A
     verdict is of all of them together; where one does not answer, the clip has no reward."""
-    fallbacks: list[OtherJudge]
-    """Loop 2: other judges, in the order in which they are tried, e.g. [{kind: openai, endpoints: [URL], model: NAME}].
-    A round that the judge could not judge is judged anew by the next one, as a whole; the round after begins with the
-    first again. Empty: an outage pauses training."""
 
 
 class PolicyConfig(SettingsSection):
@@ -266,6 +263,19 @@ class PolicyConfig(SettingsSection):
     """Initial log standard deviation of the Gaussian, normalised action units."""
     positions: bool
     """Whether the policy also sees the positions that the tokenizer's probe reads off the latents, unprojected."""
+    position_center_m: tuple[float, float, float] = (0.6, 0.0, 0.15)
+    """Commanded positions (x, y, z) are shifted by it before the networks see them."""
+    position_scale_m: PositiveFloat = 0.2
+    """Commanded positions lie within about this of the centre, by which they are divided."""
+    rotation_scale_rad: PositiveFloat = 0.5
+    """Commanded angles are divided by it."""
+    factory: FactoryName = ""
+    """module:callable(config) -> ImagePolicy instead of the one that sees by the tokenizer; empty: none."""
+
+
+class LearnerConfig(SettingsSection):
+    factory: FactoryName = ""
+    """module:callable(policy, config) -> Learner (policy_rl/training_run.py) instead of PPO; empty: none."""
 
 
 class SftConfig(SettingsSection):
@@ -274,6 +284,8 @@ class SftConfig(SettingsSection):
     num_iterations: PositiveInt
     batch_size: PositiveInt
     learning_rate: PositiveFloat
+    bags: list[str] = Field(default=[])
+    """Recordings whose successful episodes are the demonstrations, whoever acted; empty: MPLib plans them."""
 
 
 class PpoConfig(SettingsSection):
@@ -334,7 +346,9 @@ class RunConfig(SettingsSection):
     task: TaskName
     device: DeviceName
     """Of every model, reward and learner. Processes that collect in the simulator compute on the CPU."""
+    environment: EnvironmentConfig
     simulation: SimulationConfig
+    gymnasium: GymnasiumConfig
     data: DataConfig
     tokenizer: TokenizerConfig
     world_model: WorldModelConfig
@@ -343,6 +357,7 @@ class RunConfig(SettingsSection):
     reward: RewardConfig
     judge: JudgeConfig
     policy: PolicyConfig
+    learner: LearnerConfig
     sft: SftConfig
     ppo: PpoConfig
     exploit_meter: ExploitMeterConfig

@@ -11,17 +11,18 @@ from dataclasses import dataclass, replace
 
 @dataclass(frozen=True)
 class SeedRange:
-    """Reset seeds `first` to `stop` - 1 of one purpose.
-
-    block: how many of them each root seed, policy or round has for itself; 0: all share one block, the whole range.
-    settings: what asks for more or fewer of them.
-    """
+    """Reset seeds `first` to `stop` - 1 of one purpose."""
 
     purpose: str
+    """In words."""
     first: int
+    """The first one."""
     stop: int
+    """The one after the last."""
     settings: str
+    """What asks for more or fewer of them."""
     block: int = 0
+    """How many of them each root seed, policy or round has for itself; 0: all share one block, the whole range."""
 
     @property
     def blocks(self) -> int:

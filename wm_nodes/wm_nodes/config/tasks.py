@@ -1,15 +1,18 @@
 """What a task is, and where the files of the tasks are found.
 
-A task is one file, <name>.py, with TASK = Task(...). wm_nodes/environments/maniskill/tasks says how to write one. Files
-are found by the name of their package and imported when a task is asked for, so that every layer may ask. Standard
-library only: launch files list the tasks too. Shapes: P simulator ground truth, A action, S state.
+A task is one file, <name>.py, with TASK = Task(...), in a folder `tasks` of a simulator's package or in a package that
+VARIABLE names. A robot's task is its instruction; what a simulator, a world model and the judge ask of it are parts.
+Files are imported when a task is asked for, so that every layer may ask. Standard library only: launch files list the
+tasks too. Shapes: P ground truth, A action, S state.
 """
 
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from importlib import resources
 from typing import TYPE_CHECKING, Any, Literal
 
 from wm_nodes.config.extensions import find_files, load_file
@@ -22,7 +25,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float32]
 
-PACKAGE = "wm_nodes.environments.maniskill.tasks"
+FOLDER = "tasks"
 VARIABLE = "WM_TASKS"
 """Environment variable with the names of further packages of task files, separated by commas."""
 
@@ -34,6 +37,7 @@ class WeakPolicy:
     number: int
     """Decides the seeds; no two tasks of one world model have the same."""
     demonstrations: int
+    """That it is cloned from."""
     noise: float
     """Standard deviation of the exploration noise, normalised action units."""
 
@@ -61,21 +65,14 @@ class Goal:
 
 
 @dataclass(frozen=True)
-class Task:
-    """Everything that is known of one task. Its name is that of its file."""
+class SimulatorPart:
+    """How a task is built, measured and acted in a simulator."""
 
-    instruction: str
-    """What the text model and the judge read. Of a task in many scenes, it says `object` and `container`."""
     scene: Callable[[], Any]
-    """Returns ManiSkill's environment class, to which scenes.py adds cameras and a plain table top; imports the
+    """Returns the simulator's environment class, to which scenes.py adds cameras and a plain table top; imports the
     simulator only when it is called. Tasks with the same function share one scene."""
-    ground_truth_names: tuple[str, ...]
-    """Simulator truth in this order: positions in m, angles in rad, world frame. A world model's probes learn those of
-    PROBE_NAMES (world_model/tokenizer.py) that are among them."""
     measure: Callable[[Any, Floats | None], Floats]
-    """(ManiSkill environment, ground truth right after the reset or None at the reset) -> ground truth (P,)."""
-    success: Callable[[Floats], NDArray[np.bool_]]
-    """Ground truth (..., P) -> (...,); False where it is NaN."""
+    """(simulator's environment, ground truth right after the reset or None at the reset) -> ground truth (P,)."""
     waypoints: Callable[[Floats], list[Floats]]
     """Ground truth (P,) -> world tool positions (3,) of a demonstration, which MPLib plans a path through; where
     actions are poses, states (7,) with the position in the world frame."""
@@ -86,29 +83,68 @@ class Task:
     """What an action is, see core/action_spaces.py: translation, A = S = 3, or pose, 7 with rotation and gripper."""
     instruct: Callable[[Scene], str] | None = None
     """The instruction in one scene; None: the task has a scene of its own, and simulation.scenes is empty."""
-    goal: Goal | None = None
-    """None: loop 2's reward `outcome` has no number for this task."""
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    """Dotted settings of loop 1 laid over base.yaml, below the preset and the command line."""
+
+
+@dataclass(frozen=True)
+class ModelPart:
+    """What a world model learns from a task's episodes, and what its acceptance asks."""
+
+    tasks: tuple[str, ...] = ()
+    """The tasks that one world model serves, this one among them: one done output each, in this order. Those with the
+    same scene share the episodes of the last of them. Empty: this task alone."""
+    positions: Mapping[str, str] = field(default_factory=dict)
+    """Ground-truth name by the name of a position in m that the pictures show, of object_x, object_y, tool_x, tool_y,
+    tool_z, goal_x and goal_y: what probes learn. Empty: they learn all ground truth, and nothing is asked of it."""
+    moves_object: bool = True
+    """False: the error of the object is not part of acceptance, only the tool's."""
     demonstrator: str = "expert"
     """The scripted behaviour whose successes teach the text model."""
-    shows_goal: bool = True
-    """False: nothing in the pictures says where the goal is, so that no probe learns to read it."""
-    moves_object: bool = True
-    """False: the error of the object is not part of a world model's acceptance, only the tool's."""
+    weak_policies: tuple[WeakPolicy, ...] = ()
+    """Used where data.policy_episodes is not 0."""
+
+
+@dataclass(frozen=True)
+class JudgePart:
+    """What clips of a task are measured by."""
+
+    goal: Goal | None = None
+    """None: loop 2's reward `outcome` has no number for this task."""
+    object_height_m: float = 0.0
+    """Of the object's middle above the table, where it lies."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is known of one task. Its name is that of its file; an instruction is enough for a robot's."""
+
+    instruction: str
+    """What the text model and the judge read. Of a task in many scenes, it says `object` and `container`."""
+    ground_truth_names: tuple[str, ...] = ()
+    """Simulator truth in this order: positions in m, angles in rad, world frame."""
+    success: Callable[[Floats], NDArray[np.bool_]] | None = None
+    """Ground truth (..., P) -> (...,); False where it is NaN. None: success is the flag that was recorded."""
     parts: tuple[str, ...] = ()
     """Of a task whose every episode is one of another task: those, see part_of. Its states end with a value for each of
     them, 1 for the episode's and 0 for the others, and its ground truth with the number of the episode's."""
-    model_tasks: tuple[str, ...] = ()
-    """The tasks that one world model serves, this one among them: one done output each, in this order. Those with the
-    same `scene` share the episodes of the last of them. Empty: this task alone."""
-    weak_policies: tuple[WeakPolicy, ...] = ()
-    """Used where data.policy_episodes is not 0."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Dotted settings of loop 1 laid over base.yaml, below the preset and the command line."""
+    simulator: SimulatorPart | None = None
+    """None: the simulator cannot show it."""
+    model: ModelPart = field(default_factory=ModelPart)
+    """The world model's part."""
+    judge: JudgePart = field(default_factory=JudgePart)
+    """The part of what judges clips."""
 
 
 def task_names() -> tuple[str, ...]:
     """Every known task, sorted."""
     return tuple(sorted(_files()))
+
+
+def default_task() -> str:
+    """The task of base.yaml, which launch files read without a YAML package."""
+    text = resources.files("wm_nodes.config").joinpath("presets/policy/base.yaml").read_text(encoding="utf-8")
+    return str(re.findall(r"^task: (\w+)$", text, re.MULTILINE)[0])
 
 
 def check_task(name: str) -> str:
@@ -125,12 +161,12 @@ def get_task(name: str) -> Task:
     Raises:
         ValueError: no such task, or its file defines none; names what is known.
     """
-    return load_file(check_task(name), _files(), Task, PACKAGE)
+    return load_file(check_task(name), _files(), Task, __name__)
 
 
 def model_tasks(name: str) -> tuple[str, ...]:
     """The tasks of the world model that serves this one, with a file or without."""
-    return (get_task(name).model_tasks if name in task_names() else ()) or (name,)
+    return (get_task(name).model.tasks if name in task_names() else ()) or (name,)
 
 
 def parts_of(name: str) -> tuple[str, ...]:
@@ -154,17 +190,50 @@ def recorded_task(name: str) -> str:
 def shares_scene(task: str, other: str) -> bool:
     """Whether an episode that was recorded for one task shows whether the other is done. So it does where it is not
     known what it was recorded for; what has no file is shown by its own episodes alone."""
-    known = task_names()
-    if other not in known:
+    if task == other or not has_rule(other):
         return task == other
-    if task not in known or get_task(task).scene is get_task(other).scene:
+    if task not in task_names() or same_scene(task, other):
         return True
     return task in get_task(other).parts
 
 
+def same_scene(task: str, other: str) -> bool:
+    """Whether a simulator shows both tasks in one scene."""
+    scenes = [simulator.scene for name in (task, other) if (simulator := get_task(name).simulator)]
+    return len(scenes) == 2 and scenes[0] is scenes[1]
+
+
+def simulator_part(name: str) -> SimulatorPart:
+    """Of a task that the simulator can show. Raises ValueError for another one."""
+    part = get_task(name).simulator
+    if part is None:
+        raise ValueError(f"task {name!r} has no `simulator` in its file, so that nothing simulates it; take the spec "
+                         "of its robot, its recordings or its model")
+    return part
+
+
+def is_simulated(name: str) -> bool:
+    """Whether the simulator can show a task. False for no name."""
+    return bool(name) and get_task(name).simulator is not None
+
+
+def truth_columns(name: str, thing: str) -> list[int]:
+    """Which ground-truth values of a task are the position of the object, the tool or the goal; [] where none is."""
+    names, positions = get_task(name).ground_truth_names, get_task(name).model.positions
+    return [names.index(truth) for position, truth in positions.items() if position.startswith(f"{thing}_")]
+
+
+def has_rule(name: str) -> bool:
+    """Whether ground truth says that the task is done; otherwise success is the flag that was recorded."""
+    return name in task_names() and get_task(name).success is not None
+
+
 def success(task: str, ground_truth: Floats) -> NDArray[np.bool_]:
-    """Whether `task` is done in each (..., P) ground truth; False where it is NaN."""
-    return get_task(task).success(ground_truth)
+    """Whether `task` is done in each (..., P) ground truth; False where it is NaN. Raises ValueError without a rule."""
+    rule = get_task(task).success
+    if rule is None:
+        raise ValueError(f"task {task!r} has no success rule in its file; take the flag that was recorded")
+    return rule(ground_truth)
 
 
 def instruction(task: str, scenes: str) -> str:
@@ -173,13 +242,14 @@ def instruction(task: str, scenes: str) -> str:
     Raises:
         ValueError: the task has a scene of its own and `scenes` is not empty, or the other way round.
     """
-    what, known = get_task(task), scenes_of(scenes)
-    if bool(known) != (what.instruct is not None):
-        needs = "needs simulation.scenes, e.g. train" if what.instruct else "has a scene of its own; leave it empty"
+    chosen, known = get_task(task), scenes_of(scenes)
+    instruct = chosen.simulator.instruct if chosen.simulator else None
+    if bool(known) != (instruct is not None):
+        needs = "needs simulation.scenes, e.g. train" if instruct else "has a scene of its own; leave it empty"
         raise ValueError(f"simulation.scenes is {scenes!r}, but task {task!r} {needs}")
-    return what.instruct(known[0]) if what.instruct and len(known) == 1 else what.instruction
+    return instruct(known[0]) if instruct and len(known) == 1 else chosen.instruction
 
 
 def _files() -> dict[str, str]:
     """Package by task. Raises ValueError as find_files."""
-    return find_files("task", PACKAGE, VARIABLE)
+    return find_files("task", FOLDER, VARIABLE)

@@ -14,12 +14,14 @@ from wm_nodes.config.sections import (
     SettingsSection,
 )
 
-Anchor = Literal["buffer", "frozen", "lora_off", "moving", "dual"]
+Anchor = Literal["buffer", "frozen", "lora_off", "dual"]
 
 
 class FlowMatchingConfig(SettingsSection):
     num_iterations: PositiveInt
+    """Optimizer steps."""
     learning_rate: PositiveFloat
+    """Of AdamW, after its warm-up."""
     drop: Fraction
     """Share of videos whose actions and instruction are hidden, for classifier-free guidance."""
     hide_actions: Fraction
@@ -37,8 +39,9 @@ class VideoModelConfig(SettingsSection):
     codec: Literal["patch", "tokenizer"]
     """patch: principal components of patches; tokenizer: the frozen tokenizer of the task's shipped world model."""
     patch: PositiveInt
+    """Codec `patch` only: side of a patch, px."""
     channels: PositiveInt
-    """Codec `patch` only: side of a patch, px, and how many components are kept."""
+    """Codec `patch` only: how many components are kept."""
     stride: PositiveInt
     """Recorded steps between two frames."""
     num_conditioning: NonNegativeInt
@@ -46,11 +49,13 @@ class VideoModelConfig(SettingsSection):
     text_dim: NonNegativeInt
     """Values per hashed word of the instruction."""
     width: PositiveInt
+    """Of the network's layers."""
     depth: PositiveInt
-    """Of the network."""
+    """Residual blocks of the network."""
     batch_size: PositiveInt
     """Clips per training step."""
     training: FlowMatchingConfig
+    """By flow matching."""
 
     @model_validator(mode="after")
     def _cuts_something(self) -> Self:
@@ -77,6 +82,7 @@ class VideoEvaluationConfig(SettingsSection):
     """Held-out contexts, one ODE clip each, before, during and after training."""
 
     contexts: PositiveInt
+    """Of the held-out ones, the first so many."""
     num_steps: PositiveInt
     """Sampler steps."""
     every: NonNegativeInt
@@ -91,12 +97,13 @@ class VideoEvaluationConfig(SettingsSection):
 class WindowConfig(SettingsSection):
     """Which sampler steps are stochastic."""
 
-    strategy: Literal["all", "progressive", "random", "decay", "exp_decay", "fast"]
-    """all: every step. Else a window of `size` steps. progressive: it moves on by one every `period` iterations; decay:
-    after fewer iterations the further it is, down to a quarter of the period; exp_decay: the same, exponentially from
-    step 13 on; random: it is drawn anew each iteration; fast: so, in the first half (Flow-GRPO-Fast)."""
+    strategy: Literal["all", "progressive", "random", "fast"]
+    """all: every step. Else a window of `size` steps. progressive: it moves on by one every `period` iterations;
+    random: it is drawn anew each iteration; fast: so, in the first half (Flow-GRPO-Fast)."""
     size: PositiveInt
+    """Steps in the window."""
     period: PositiveInt
+    """Iterations at one place, with `progressive`."""
 
 
 class MaskConfig(SettingsSection):
@@ -106,37 +113,22 @@ class MaskConfig(SettingsSection):
     """Exploration left where nothing moves; a cell without any has no density. 0.05 is very little."""
     quantile: Fraction
     """Cells whose intensity of motion reaches this quantile (q of DD-8) count as dynamic."""
-    combine: Literal["gated", "sparse", "convex", "max"]
+    combine: Literal["gated", "sparse"]
     """How intensity I and sparse prior P become the mask (DD-9). gated: m_min + (1 - m_min) I P, the paper's reading;
-    sparse: m_min + (1 - m_min) P; convex: m_min + (1 - m_min)(a I + (1 - a) P); max: max(m_min, I P)."""
-    convex_share: Fraction
-    """a of `convex`."""
-    channel_norm: Literal["rms", "l1", "max"]
-    """How the channels of a temporal difference become one intensity (DD-7)."""
-    norm: Literal["max", "q99"]
-    """What an intensity is divided by; q99 is the 0.99 quantile, less sensitive to one hot cell."""
-    norm_scope: Literal["sample", "frame"]
-    """Over the whole sample, or per frame (gives still frames full exploration)."""
-    diff: Literal["backward", "central"]
-    """Temporal difference of DD-6."""
-    budget: Literal["literal", "rms", "peak"]
-    """DD-9b. literal: unchanged; rms: its mean square over generated cells becomes 1; peak: over dynamic ones."""
-    time_limit: float
-    """Above this t the mask is 1 everywhere, because the clean estimate says little about motion near pure noise."""
+    sparse: m_min + (1 - m_min) P."""
+    budget: Literal["literal", "rms"]
+    """DD-9b. literal: unchanged; rms: its mean square over generated cells becomes 1."""
 
 
 class SamplerConfig(SettingsSection):
+    """What decides the Gaussian of a step; see video_model/kernels.py."""
+
     arm: Literal["ode", "cps", "dyndiff", "flow", "dance", "sage"]
     """flow: Flow-GRPO; dance: DanceGRPO; sage: SAGE-GRPO."""
     eta: NonNegativeFloat
     """Noise level; in [0, 1] for cps and dyndiff."""
-    sigma_map: Literal["sin", "linear"]
-    """sigma_base = s sin(pi eta / 2), or eta s."""
     mask: MaskConfig
-    mask_on: Literal["std", "var", "eta"]
-    """What the mask scales: the standard deviation, its square, or eta."""
-    mask_dtype: Literal["float32", "float16"]
-    """The mask is rounded to it before it is used, so that a stored mask is the used one."""
+    """Of dyndiff only."""
 
     @field_validator("eta")
     @classmethod
@@ -150,55 +142,43 @@ class RolloutConfig(SettingsSection):
     """How videos are sampled."""
 
     num_steps: PositiveInt
+    """Of the sampler."""
     shift: PositiveFloat
     """Of the flow times towards the noise; 1: none."""
     cfg: float
     """Classifier-free guidance g of v_u + g (v_c - v_u); 1: off."""
     sampler: SamplerConfig
+    """What a step draws from."""
     storage_dtype: Literal["float32", "bfloat16"]
     """Of the kept latents; a state is rounded to it before its log-probability is taken."""
-    noise_store: Literal["zeta", "zeta_bfloat16", "seed"]
+    noise_store: Literal["zeta", "zeta_bfloat16"]
     """What is kept of each step's noise. zeta: all, as large as the latents; zeta_bfloat16: half as large, with a KL of
-    1e-6 at its own anchor; seed: only the seed it was drawn from, needs float32 latents."""
+    1e-6 at its own anchor."""
     micro_batch: PositiveInt
     """Videos per network call."""
     buffer_device: Literal["model", "cpu"]
     """Where rollout buffers lie: with the model, or in the host's memory, from where training moves micro-batches."""
 
-    @field_validator("noise_store")
-    @classmethod
-    def _can_be_drawn_again(cls, noise_store: str, info: ValidationInfo) -> str:
-        if noise_store == "seed" and info.data.get("storage_dtype") != "float32":
-            raise ValueError("seed needs storage_dtype float32: what rounding a state changes cannot be drawn again")
-        return noise_store
-
 
 class AdvantageConfig(SettingsSection):
     clip: PositiveFloat
     """Of the normalised advantage."""
-    mix: Literal["reward", "advantage"]
-    """Several rewards are added before they are normalised, or each is normalised and then weighed."""
-    std_scope: Literal["group", "global", "batch", "running"]
-    """Which standard deviation normalises, see video_rl/group_advantages.py; flow_grpo's global_std is batch."""
-    ddof: NonNegativeInt
+    std_scope: Literal["group", "global"]
+    """Which standard deviation normalises, see video_rl/group_advantages.py."""
     best_of_n: NonNegativeInt
     """Videos of a group that train, best and worst; 0: all."""
-    floor: NonNegativeFloat
-    """A group with std < floor max(1, |mean|) has no spread."""
-    source: Literal["reward", "win_rate"]
-    """What is normalised; win_rate: Pref-GRPO's share of wins against the others of the group."""
 
 
 class KlConfig(SettingsSection):
-    mode: Literal["mean", "logk2", "logk3", "velocity", "none"]
+    mode: Literal["mean", "logk2", "velocity", "none"]
+    """mean: DD-17, of the means of a step; logk2: of log-probabilities; velocity: of velocities (DD-17a)."""
     beta: NonNegativeFloat
     """Weight."""
     anchor: Anchor
     """buffer: what sampled; frozen: the model as it was at the start; lora_off: the same with the adapter switched off;
-    moving: the weights of every `moving_updates`-th update; dual: buffer always, and frozen on every `dual_every`-th
-    update."""
-    moving_updates: PositiveInt
+    dual: buffer always, and frozen on every `dual_every`-th update."""
     dual_every: PositiveInt
+    """Updates from one use of the frozen anchor to the next, with `dual`."""
 
 
 class NftConfig(SettingsSection):
@@ -212,8 +192,6 @@ class NftConfig(SettingsSection):
     """How much of the old weights stays after each buffer; 0: they are those that sample the next one."""
     old_ramp: PositiveFloat
     """The decay rises to old_decay by this much per optimizer step; from 1 on it is constant."""
-    adaptive: bool
-    """Divide each squared error by its mean absolute error."""
 
 
 class GrpoConfig(SettingsSection):
@@ -223,27 +201,23 @@ class GrpoConfig(SettingsSection):
     """ratio: GRPO, by the likelihoods of sampled steps. nft: DiffusionNFT, by noise added to the final clips, from any
     sampler; what is said of ratios, clips and steps below then has no effect."""
     nft: NftConfig
+    """Of objective nft."""
     advantage: AdvantageConfig
+    """What a reward is worth beside those of its group."""
     kl: KlConfig
+    """Distance to an anchor, which is added to the loss."""
     trains: Literal["all", "condition"]
     """Every parameter that asks for a gradient, or those that carry the condition alone."""
     clip_low: NonNegativeFloat
-    clip_high: NonNegativeFloat
     """The probability ratio is clipped to [1 - clip_low, 1 + clip_high]."""
+    clip_high: NonNegativeFloat
+    """See clip_low."""
     logprob_weight: Literal["full", "cps", "base"]
-    mask_source: Literal["cached", "recompute"]
-    ratio_norm: bool
-    """Centre the log ratio and scale it by the standard deviation."""
-    equalise: bool
-    """Weigh steps by SAGE's equaliser."""
+    """Weight of an element in the ratio (DD-14c)."""
     updates_per_buffer: PositiveInt
-    """Optimizer steps on one buffer."""
-    passes: Literal["full", "parts"]
-    """Each optimizer step on the whole buffer, or on its own part of the videos."""
+    """Optimizer steps on one buffer, each on all of it."""
     step_fraction: Fraction
-    step_select: Literal["random", "first", "tmin"]
-    """Which stochastic steps train. random: this share of them, drawn per video; first: the first ones; tmin:
-    those with t >= step_fraction."""
+    """Share of the stochastic steps that train, drawn per video."""
     min_s: NonNegativeFloat
     """Steps that end below this time never train."""
     cfg: float
@@ -251,8 +225,11 @@ class GrpoConfig(SettingsSection):
     micro_batch: PositiveInt
     """Transitions per network call."""
     learning_rate: NonNegativeFloat
+    """Of AdamW."""
     weight_decay: NonNegativeFloat
+    """Of AdamW."""
     max_grad_norm: PositiveFloat
+    """A longer gradient is scaled to it."""
     ema_decay: Annotated[float, Field(ge=0, lt=1)]
     """Decay of the average of the weights that is evaluated; 0: none."""
     max_staleness: NonNegativeInt
@@ -267,27 +244,7 @@ class GrpoConfig(SettingsSection):
         ):
             raise ValueError(
                 f"objective nft has no transitions, got kl.mode {kl.mode} with kl.anchor {kl.anchor}; take kl.mode "
-                "none, or velocity with kl.anchor frozen, moving or lora_off"
-            )
-        ablations = {"mask_source recompute": self.mask_source == "recompute", "ratio_norm": self.ratio_norm}
-        given = [name for name, on in {**ablations, "equalise": self.equalise}.items() if on]
-        if self.objective == "nft" and given:
-            raise ValueError(f"objective nft has no ratio, got {', '.join(given)}; switch it off, or take ratio")
-        return self
-
-    @model_validator(mode="after")
-    def _one_ratio(self) -> Self:
-        """logprob_weight, mask_source and ratio_norm each say what the ratio is; two of them contradict each other."""
-        others = {"logprob_weight": self.logprob_weight != "full", "ratio_norm": self.ratio_norm}
-        if self.mask_source == "recompute" and any(others.values()):
-            given = ", ".join(f"{name} {getattr(self, name)}" for name, other in others.items() if other)
-            raise ValueError(
-                f"mask_source recompute has the full likelihood (DD-12), got {given}; take logprob_weight full and "
-                "ratio_norm false, or mask_source cached"
-            )
-        if all(others.values()):
-            raise ValueError(
-                f"ratio_norm replaces the weight of the likelihood, got logprob_weight {self.logprob_weight}; take full"
+                "none, or velocity with kl.anchor frozen or lora_off"
             )
         return self
 
@@ -296,7 +253,9 @@ class VideoRlConfig(SettingsSection):
     """Everything of a run of loop 2."""
 
     seed: NonNegativeInt
+    """Of every random number."""
     task: TaskName
+    """Whose episodes contexts are taken from."""
     device: DeviceName
     """Of the video model, its codec, the rewards and the learner."""
     iterations: NonNegativeInt
@@ -313,12 +272,19 @@ class VideoRlConfig(SettingsSection):
     `ssim`, `perceptual`, `psnr_db`, `scenery` need no simulator state; or `agent`, which needs a judge. Several are
     added, e.g. {outcome: 0.5, agent: 0.5}."""
     judge: JudgeConfig
+    """Where the agent is among the rewards."""
     model: VideoModelConfig
+    """What is trained."""
     groups: GroupConfig
+    """What is sampled for a buffer."""
     evaluation: VideoEvaluationConfig
+    """On held-out contexts."""
     window: WindowConfig
+    """Of stochastic sampler steps."""
     rollout: RolloutConfig
+    """How it is sampled."""
     grpo: GrpoConfig
+    """How it is learned from."""
 
     @model_validator(mode="after")
     def _knows_its_conditions(self) -> Self:

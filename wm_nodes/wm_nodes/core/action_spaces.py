@@ -1,8 +1,8 @@
-"""What actions and states of the robot's tool mean. A task chooses one: Task.actions."""
+"""What actions and states of the robot's tool mean. A simulated task chooses one: SimulatorPart.actions."""
 
 from dataclasses import dataclass
 
-from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.core.specs import EnvironmentSpec
 
 AXES = ("x", "y", "z")
 MAX_TILT_RAD, MAX_YAW_RAD = 0.6, 1.8
@@ -12,21 +12,14 @@ all, so that the rotation vector never jumps."""
 
 @dataclass(frozen=True)
 class ActionSpace:
-    """Names and units of an action (A,) in [-1, 1], and of the state (S,) that it commands."""
+    """What an action (A,) in [-1, 1] moves, and the state (S,) that it commands."""
 
     action_names: tuple[str, ...]
+    """Of an action's values."""
     state_names: tuple[str, ...]
+    """Of a state's values, each commanded by the action's of the same place."""
     units: tuple[str, ...]
-
-    def scale(self, config: SimulationConfig) -> tuple[float, ...]:
-        """Of a full-scale action, in the units."""
-        by_unit = {"m": config.max_action_m, "rad": config.max_action_rad, "1": 1.0}
-        return tuple(by_unit[unit] for unit in self.units)
-
-    def box(self, config: SimulationConfig) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Least and largest state."""
-        rest = (MAX_TILT_RAD, MAX_TILT_RAD, MAX_YAW_RAD, 1.0)[: len(self.units) - 3]
-        return (*config.workspace_low_m, *(-limit for limit in rest)), (*config.workspace_high_m, *rest)
+    """Of both: m, rad, or 1."""
 
 
 TRANSLATION = ActionSpace(
@@ -41,3 +34,18 @@ POSE = ActionSpace(
 """The tool moves and turns about the axes of the robot's base, by a rotation vector; the gripper's command is absolute,
 -1 closed, 1 open. State: position, rotation vector from the tool that points straight down, gripper command."""
 SPACES = {"translation": TRANSLATION, "pose": POSE}
+
+
+def tool_columns(spec: EnvironmentSpec) -> tuple[list[int], list[int]]:
+    """Which values of an action and of a state are the tool's position (x, y, z).
+
+    Raises:
+        ValueError: the robot commands no such position.
+    """
+    wanted = ((spec.action_names, TRANSLATION.action_names), (spec.state_names, TRANSLATION.state_names))
+    for names, position in wanted:
+        if missing := [name for name in position if name not in names]:
+            raise ValueError(f"environment {spec.env_id} has no {', '.join(missing)}, only {', '.join(names)}; a robot "
+                             "whose tool is not commanded by its position cannot be judged by where it is")
+    actions, states = ([names.index(name) for name in position] for names, position in wanted)
+    return actions, states

@@ -15,22 +15,19 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class CameraModel:
-    """One camera of an Environment.
-
-    name: as in EnvironmentSpec.cameras. width, height: of its picture, px.
-    K: (3, 3), px, of a picture without distortion.
-    pose: (4, 4), from its optical axes to the robot's base frame; of a camera that moves, a function that gives it for
-        environment 0 to N - 1 as of the last observation.
-
-    Raises:
-        ValueError: names the value and the remedy.
-    """
+    """One camera of an Environment. Raises ValueError: names the value and the remedy."""
 
     name: str
+    """As in EnvironmentSpec.cameras."""
     width: int
+    """Of its picture, px."""
     height: int
+    """Of its picture, px."""
     K: Matrix
+    """(3, 3), px, of a picture without distortion."""
     pose: Matrix | Callable[[int], Matrix]
+    """(4, 4), from its optical axes to the robot's base frame; of a camera that moves, a function that gives it for
+    environment 0 to N - 1 as of the last observation."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z]\w*", self.name, re.ASCII):

@@ -1,4 +1,4 @@
-"""Errors that end a command: their text says what happened and what to do."""
+"""Errors that more than one room raises: their text says what happened and what to do."""
 
 
 class RunError(RuntimeError):
@@ -7,3 +7,11 @@ class RunError(RuntimeError):
 
 class ModelNotAcceptedError(RunError):
     """A world model does not pass acceptance, so no policy may be trained in it."""
+
+
+class WireError(Exception):
+    """A refused request or message: code is one of wm_msgs/ErrorCode, the text names the value and the remedy."""
+
+    def __init__(self, code: int, text: str) -> None:
+        super().__init__(text)
+        self.code = code

@@ -12,8 +12,8 @@ from wm_nodes.config.seed_ranges import HELDOUT, STARTS, SeedRange, demonstratio
 from wm_nodes.config.tasks import get_task, model_tasks, recorded_task
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import Episode
-from wm_nodes.environments.maniskill import collection
-from wm_nodes.environments.maniskill.collection import CollectionPlan, collect
+from wm_nodes.environments import collection
+from wm_nodes.environments.collection import CollectionPlan, collect
 from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.recording import Bag, EpisodeBagWriter
 

@@ -73,6 +73,7 @@ class CheckReport:
     kept: Share
     """Clean and benign successes that mode reward pays."""
     paid_faults: Share
+    """Clips with a fault that mode reward pays."""
     balanced: float
     """Balanced accuracy of "overall"."""
     separates: bool

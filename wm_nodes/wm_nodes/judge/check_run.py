@@ -55,8 +55,11 @@ class Judged:
     """The verdict on one clip in one mode."""
 
     clip: LabelledClip
+    """With its label."""
     mode: Mode
+    """Of the agent."""
     verdict: Verdict
+    """Of the agent."""
     fresh: bool
     """No answer was a kept one, so that its time counts."""
 
@@ -66,7 +69,9 @@ class CheckRun:
     """Everything that a judge answered."""
 
     rubric: Rubric
+    """By which was judged."""
     judged: list[Judged] = field(default_factory=list)
+    """In the order of their ends."""
     not_judged: dict[str, str] = field(default_factory=dict)
     """clip_id to the reason, of clips that the judge cannot read at all."""
     reads: list[Read] = field(default_factory=list)

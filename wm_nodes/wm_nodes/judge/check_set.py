@@ -39,6 +39,7 @@ class ClipTruth(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     clip_id: str
+    """As in clips.jsonl."""
     part: Literal["near", "policy"]
     """Near cameras, or the policy's picture."""
     kind: str

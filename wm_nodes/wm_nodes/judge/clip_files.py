@@ -37,9 +37,13 @@ class ClipLine(BaseModel):
     frames: Annotated[int, Field(ge=2)] | None = None
     """How many a .png holds; of no other file."""
     instruction: str
+    """What the clip should show."""
     clip_id: str = ""
+    """Empty: the file's name without its ending."""
     task_id: str = ""
+    """Name of the task, which chooses an embedded judge."""
     robot: str = "panda"
+    """Description for the prompt."""
     fps: Annotated[float, Field(gt=0)] = 5.0
     """Of a .npy or .png; a video has its own."""
     reference: str = ""
@@ -57,8 +61,8 @@ def read_list(folder: Path, read: Read = read_regular) -> list[ClipLine]:
         content = text_lines(read(path, CLIP_LIST))
     except (FileNotFoundError, NotADirectoryError):
         raise ValueError(
-            f'{path} is missing: one line per clip, e.g. {{"file": "a.mp4", "instruction": "push the cube", "task_id": '
-            '"push_cube"}'
+            f'{path} is missing: one line per clip, e.g. {{"file": "a.mp4", "instruction": "lift the lid", "task_id": '
+            '"push"}'
         ) from None
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is no text in UTF-8: {error}; write the list again") from None

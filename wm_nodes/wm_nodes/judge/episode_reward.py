@@ -13,12 +13,12 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wm_nodes.config.load import judge_or_embedded
 from wm_nodes.config.schema import AGENT, JudgeConfig, RunConfig
+from wm_nodes.core.lockstep import LockStep
 from wm_nodes.core.specs import EnvironmentSpec
-from wm_nodes.core.types import BoolArray, FloatArray, Rollout, UInt8Array, UInt64Array
+from wm_nodes.core.types import BoolArray, FloatArray, Rollout, UInt8Array
 from wm_nodes.environments.registry import configured_spec
 from wm_nodes.judge.agent.contract import MAX_INVALID_SHARE
 from wm_nodes.judge.agent.rubric import load_rubric
@@ -30,37 +30,20 @@ from wm_nodes.reward import SUCCESS_UNKNOWN, RewardResult
 from wm_nodes.reward.base import version_of
 
 
-@dataclass(frozen=True, eq=False)
-class EpisodeStep:
-    """One lock-step of N environments."""
-
-    images: UInt8Array | None
-    """uint8 (N, H, W, 3) before the step; None where they were lost."""
-    next_images: UInt8Array | None
-    """The same after the step."""
-    actions: FloatArray
-    """float32 (N, A)."""
-    episode_ids: UInt64Array
-    """(N,)."""
-    episode_steps: NDArray[np.uint32]
-    """(N,), number of the step in its episode, from 0."""
-    ended: BoolArray
-    """bool (N,), terminated or truncated by this step."""
-    valid: BoolArray
-    """bool (N,), False where the message is a reset and no step."""
-    goals: Mapping[int, UInt8Array] = field(default_factory=dict)
-    """Goal image, uint8 (H, W, 3), by environment, where there is one."""
-
-
 @dataclass
 class _Episode:
-    """The collected part of an episode. fault: why it cannot be judged."""
+    """The collected part of an episode."""
 
     episode_id: int
+    """As in the messages."""
     frames: list[UInt8Array] = field(default_factory=list)
+    """uint8 (H, W, 3) each."""
     actions: list[FloatArray] = field(default_factory=list)
+    """(A,) each."""
     goal: UInt8Array | None = None
+    """The newest goal image."""
     fault: str = ""
+    """Why it cannot be judged."""
 
 
 @dataclass(frozen=True)
@@ -112,10 +95,9 @@ def check_agent(config: RunConfig, *, trains: bool = True) -> None:
     trains: rollouts of ppo.num_steps are trained on.
 
     Raises:
-        ValueError, ConfigError: as check_judge, load_rubric, check_horizon and check_clips; fallbacks are named.
+        ValueError, ConfigError: as check_judge, load_rubric, check_horizon and check_clips.
     """
     check_judge(config.judge)
-    _refuse_fallbacks(config.judge)
     load_rubric(config.judge.rubric)
     spec = _scene(config)
     if trains:
@@ -135,15 +117,6 @@ def _scene(config: RunConfig) -> EnvironmentSpec:
 def _longest_clip(spec: EnvironmentSpec) -> tuple[int, ...]:
     """Shape of the longest episode as a clip."""
     return (spec.max_episode_steps + 1, spec.height, spec.width, spec.channels)
-
-
-def _refuse_fallbacks(settings: JudgeConfig) -> None:
-    if settings.fallbacks:
-        raise ValueError(
-            f"judge.fallbacks names {len(settings.fallbacks)}, but others stand in for whole rounds of loop 2 only; a "
-            "policy's episodes are judged one by one. Leave it empty: an outage pauses training, which then makes the "
-            "same rollout again"
-        )
 
 
 def check_horizon(num_steps: int, max_episode_steps: int) -> None:
@@ -179,13 +152,12 @@ def unjudged_reason(rollout: Rollout) -> str:
 class EpisodeReward:
     """Collects the lock-steps of one environment node into episodes and has each judged at its end.
 
-    cut: episodes that a reset ended before their last step, unjudged. Raises ValueError: the judge has fallbacks.
+    cut: episodes that a reset ended before their last step, unjudged.
     """
 
     name = AGENT
 
     def __init__(self, judge: JudgeService) -> None:
-        _refuse_fallbacks(judge.settings)
         self._judge = judge
         self.cut = 0
         self._open: dict[int, _Episode] = {}
@@ -200,17 +172,17 @@ class EpisodeReward:
         self.cut += len(self._open)
         self._open.clear()
 
-    def add(self, step: EpisodeStep, spec: EnvironmentSpec, session: int) -> PendingReward:
-        """Add the next lock-step of a session of the environment, and judge the episodes that end with it."""
+    def add(self, step: LockStep, spec: EnvironmentSpec) -> PendingReward:
+        """Add the next lock-step of the environment, joined, and judge the episodes that end with it."""
         waited: dict[int, Future[Verdict] | str] = {}
         for n in map(int, np.flatnonzero(step.valid)):
             episode = self._extend(n, step)
             if step.ended[n]:
                 del self._open[n]
-                waited[n] = episode.fault or self._judge.submit(self._job(episode, spec, session))
+                waited[n] = episode.fault or self._judge.submit(self._job(episode, spec, step.session))
         return PendingReward(step.valid, waited)
 
-    def _extend(self, n: int, step: EpisodeStep) -> _Episode:
+    def _extend(self, n: int, step: LockStep) -> _Episode:
         """Add the step to the episode of environment n and return the episode."""
         episode, episode_id = self._open.get(n), int(step.episode_ids[n])
         if episode is None or episode.episode_id != episode_id:
@@ -224,7 +196,8 @@ class EpisodeReward:
         else:
             episode.frames += [images[n].copy() for images in (step.images, step.next_images)[int(num_steps > 0) :]]
         episode.actions.append(step.actions[n].copy())
-        episode.goal = step.goals.get(n, episode.goal)
+        if step.goals is not None and step.goals[1][n]:
+            episode.goal = step.goals[0][n]
         return episode
 
     def _job(self, episode: _Episode, spec: EnvironmentSpec, session: int) -> ClipJob:

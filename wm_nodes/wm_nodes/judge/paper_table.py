@@ -28,6 +28,7 @@ class TableRow:
     """One row; NaN where all labels are equal."""
 
     name: str
+    """Of the row."""
     n: int
     """Labelled clips that the judge decided."""
     silent: int
@@ -35,6 +36,7 @@ class TableRow:
     accuracy: float
     """Weighted share of equal decisions."""
     low: float
+    """95 % Wilson interval of the accuracy."""
     high: float
     """95 % Wilson interval of the accuracy."""
     prevalence: float
@@ -42,6 +44,7 @@ class TableRow:
     balanced: float
     """Balanced accuracy; of planning, the mean recall of its levels."""
     kappa: float
+    """Cohen's, of decisions and labels."""
     calibration: float
     """Expected calibration error of p_pass; of planning, of the chosen level."""
     paper: float | None

@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from wm_nodes.config.schema import AGENT
+from wm_nodes.core.lockstep import LockStep
 from wm_nodes.judge.agent.verdict import Verdict
-from wm_nodes.judge.episode_reward import EpisodeReward, EpisodeStep, PendingReward
+from wm_nodes.judge.episode_reward import EpisodeReward, PendingReward
 from wm_nodes.judge.service import JudgeService
 from wm_nodes.recording import Bag
-from wm_nodes.recording.lockstep import LockSteps, RecordedStep
+from wm_nodes.recording.join import LockSteps
 from wm_nodes.reward import RewardResult
 
 
@@ -37,10 +38,10 @@ def judge_bag(path: Path, judge: JudgeService, *, namespace: str | None = None) 
     """Judge every episode that ends in a live recording. namespace: of the environment; None takes the only one.
 
     Raises:
-        BagError: an unusable bag. ValueError: the judge has fallbacks.
+        BagError: an unusable bag.
     """
     judged, model = JudgedBag(), EpisodeReward(judge)
-    waiting = deque[tuple[RecordedStep, PendingReward]]()
+    waiting = deque[tuple[LockStep, PendingReward]]()
     with Bag(path) as bag:
         steps = LockSteps(bag, namespace=namespace, reward_name=AGENT)
         session = None
@@ -49,12 +50,7 @@ def judge_bag(path: Path, judge: JudgeService, *, namespace: str | None = None) 
                 model.forget()
                 session = step.session
             if not step.is_reset and step.valid.any():
-                goals, there = step.goals if step.goals is not None else ((), ())
-                lockstep = EpisodeStep(
-                    step.images, step.next_images, step.actions, step.episode_id, step.episode_step,
-                    step.terminated | step.truncated, step.valid, {n: goals[n] for n in np.flatnonzero(there).tolist()},
-                )
-                waiting.append((step, model.add(lockstep, steps.spec, step.session)))
+                waiting.append((step, model.add(step, steps.spec)))
     while waiting:
         step, pending = waiting.popleft()
         result = pending.result()
@@ -62,11 +58,11 @@ def judge_bag(path: Path, judge: JudgeService, *, namespace: str | None = None) 
         judged.unseen += [reason for reason in pending.waited.values() if isinstance(reason, str)]
         place = step.session, step.step_id
         judged.results[place] = result
-        if step.reward is not None and step.reward.reward_version == model.version:
-            answered = step.reward.valid | ~step.valid
+        if step.rewards is not None and step.rewards.version == model.version:
+            answered = step.rewards.valid | ~step.valid
             judged.compared += 1
             judged.unanswered += int((~answered).sum())
-            same = step.reward.total[answered].tobytes() == result.total[answered].tobytes()
-            if not same or not np.array_equal(step.reward.valid[answered], result.valid[answered]):
+            same = step.rewards.total[answered].tobytes() == result.total[answered].tobytes()
+            if not same or not np.array_equal(step.rewards.valid[answered], result.valid[answered]):
                 judged.different.append(place)
     return judged

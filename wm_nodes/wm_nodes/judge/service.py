@@ -7,7 +7,7 @@ import asyncio
 import math
 import threading
 import time
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -23,7 +23,6 @@ from wm_nodes.config.schema import AGENT, JudgeConfig
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import CPU
 from wm_nodes.core.named_files import RUBRIC, NamedFiles
-from wm_nodes.judge.agent.contract import MAX_INVALID_SHARE
 from wm_nodes.judge.agent.judge import Cost, Health
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
@@ -32,7 +31,7 @@ from wm_nodes.judge.agent.types import GATED, ClipRef, Status, TaskSpec, clip_re
 from wm_nodes.judge.agent.verdict import Provenance, Verdict, content_hash
 from wm_nodes.judge.audit.log import AuditLog
 from wm_nodes.judge.audit.recording import AuditedAgent, write_exchange
-from wm_nodes.judge.backends.factory import OpenedJudge, check_judge, evidence_judge, judges_of, make_judge
+from wm_nodes.judge.backends.factory import OpenedJudge, evidence_judge, for_task, make_judge
 from wm_nodes.recording.reader import read_spec
 from wm_nodes.video_model.clips import Clips
 
@@ -53,11 +52,14 @@ class TrainingPaused(Exception):
 
 @dataclass(frozen=True, eq=False)
 class ClipJob:
-    """A clip and what it should show. problem: why its pixels cannot be read; its verdict is then an ERROR."""
+    """A clip and what it should show."""
 
     clip: ClipRef
+    """To judge."""
     task: TaskSpec
+    """What it should show."""
     problem: str = ""
+    """Why its pixels cannot be read; its verdict is then an ERROR."""
 
 
 @dataclass
@@ -65,8 +67,11 @@ class VerdictCounts:
     """Number and cost of the verdicts since the start."""
 
     verdicts: int = 0
+    """All."""
     by_status: dict[Status, int] = field(default_factory=dict)
+    """Number of each status."""
     cost: Cost = field(default_factory=Cost)
+    """Of all together."""
 
     def add(self, verdict: Verdict) -> None:
         self.verdicts += 1
@@ -85,65 +90,42 @@ class VerdictCounts:
 
 @dataclass
 class _JudgeSlot:
-    """One judge with its agent. failed_last_round: it answered too few clips of its last round, see _FallbackBudget."""
+    """One judge with its agent."""
 
     opened: OpenedJudge
     agent: RewardAgent | AuditedAgent
-    failed_last_round: bool = False
 
     @property
     def judge_id(self) -> str:
         return self.agent.judge.capabilities.judge_id
 
 
-class _FallbackBudget:
-    """Counts the unanswered clips of a round and decides when the next judge takes the round over.
-
-    over: more than MAX_INVALID_SHARE of the clips have no answer, or the single clip that was sent as a test has none.
-    Clips that end after the round's deadline do not count, because no other judge could answer them in time.
-    reason: of the newest clip without an answer.
-    """
-
-    def __init__(self, num_clips: int, deadline: float | None) -> None:
-        self._left, self._deadline = MAX_INVALID_SHARE * num_clips, deadline
-        self.over, self.reason = False, ""
-
-    def record(self, verdict: Verdict, *, alone: bool) -> None:
-        if verdict.status is not Status.ERROR:
-            return
-        self._left -= 1
-        self.reason = verdict.reason
-        in_time = self._deadline is None or time.monotonic() < self._deadline
-        self.over = self.over or (in_time and (alone or self._left < 0))
-
-
 class JudgeService:
     """Runs a reward agent on an event loop in a thread of its own; at most `concurrency` clips at a time.
 
-    settings.fallbacks are further judges for whole rounds, see judge. fallen_back: why another judge than the first
-    judged the last round, and which; "" where the first did.
-
     Args:
+        tasks: of the clips, each of which is judged by the judge of its task, see for_task; (): the settings name the
+            judge of all. Clips of a task without a judge, or of another than these, have an ERROR that says so.
         reads: folder that keeps the judge's answers; None: none are kept.
         audit: folder of the audit log that every question, answer and verdict goes into; None: none is written.
         model_dir: world model whose normal ranges say how strange a clip is beside a server's answers; None: none does.
         device: the setting `device` (core/device.py), where embedded judges compute.
 
     Raises:
-        ValueError, MissingPackageError: as make_judge. ConfigError: the rubric is refused.
+        ValueError, MissingPackageError: as make_judge; not one task has a judge. ConfigError: the rubric is refused.
         AuditError: as AuditLog.
     """
 
     def __init__(
-        self, settings: JudgeConfig, *, seed: int, reads: Path | None = None, audit: Path | None = None,
-        model_dir: Path | None = None, device: str = CPU,
+        self, settings: JudgeConfig, *, seed: int, tasks: Iterable[str] = (), reads: Path | None = None,
+        audit: Path | None = None, model_dir: Path | None = None, device: str = CPU,
     ) -> None:
         self.settings, self._seed, self._reads, self._device = settings, seed, reads, device
         self._evidence = evidence_judge(settings, model_dir, device)
         self._log = None if audit is None else AuditLog(audit)
         self.pack, self.tally, self.health = settings.rubric, VerdictCounts(), Health(True, "not asked yet")
+        self._settings_of, self._refused = _settings_by_task(settings, tasks)
         self._slots = self._make_slots(load_rubric(settings.rubric))
-        self.fallen_back, self._used = "", self._slots[0]
         self._semaphore = asyncio.Semaphore(settings.concurrency)
         self._health_asked_s = -math.inf
         self._health_request: Future[None] | None = None
@@ -153,27 +135,26 @@ class JudgeService:
 
     @property
     def rubric(self) -> Rubric:
-        return self._slots[0].agent.rubric
+        return self._first.agent.rubric
 
     @property
     def version(self) -> str:
         """Of the words that the judges are asked in, see RewardAgent."""
-        return self._slots[0].agent.version
+        return self._first.agent.version
 
     @property
     def judge_id(self) -> str:
-        """Identity of the judge of the last round; before the first round, of the first judge."""
-        return self._used.judge_id
+        """Identity of the judge, or of all, where tasks have different ones."""
+        return "; ".join(dict.fromkeys(slot.judge_id for slot in self._slots.values()))
 
-    @property
-    def judge_ids(self) -> list[str]:
-        """Identities of all judges, in the order in which they are tried."""
-        return [slot.judge_id for slot in self._slots]
+    def judge_of(self, task: str) -> str:
+        """Identity of the judge of a task."""
+        return self._slot_of(task).judge_id
 
     @property
     def cards(self) -> list[str]:
         """The measured abilities of each judge, as text; judges without a measurement are left out."""
-        return [card for slot in self._slots if (card := slot.agent.judge.capabilities.card)]
+        return [card for slot in self._slots.values() if (card := slot.agent.judge.capabilities.card)]
 
     def set_rubric(self, pack: str, files: NamedFiles) -> None:
         """Judge by another rubric from now on; call it while nothing is being judged.
@@ -188,66 +169,50 @@ class JudgeService:
         """
         rubric = load_rubric(pack, read=lambda name: files.read(name, RUBRIC))
         old, self._slots = self._slots, self._make_slots(rubric)
-        self.pack, self.fallen_back, self._used = pack, "", self._slots[0]
-        for slot in old:
+        self.pack = pack
+        for slot in old.values():
             self._run(slot.opened.close())
 
     def submit(self, job: ClipJob, deadline: float | None = None) -> "Future[Verdict]":
-        """Have the first judge judge one clip, concurrency permitting. deadline: on the time.monotonic clock, s."""
-        return self._run(self._judge_clip(self._slots[0].agent, job, deadline))
+        """Have one clip judged, concurrency permitting. deadline: on the time.monotonic clock, s."""
+        return self._run(self._judge_clip(job, deadline))
 
     def judge(
         self, jobs: Sequence[ClipJob], *, check: Callable[[], None] = lambda: None,
         done: Callable[[int, Verdict], None] = lambda index, verdict: None, within_s: float | None = None,
-        round_number: int = 0, by: str = "",
+        round_number: int = 0,
     ) -> list[Verdict]:
-        """Judge a round of clips by one judge and one rubric; the verdicts are in the order of the jobs.
-
-        If a judge leaves more than MAX_INVALID_SHARE of the clips without an answer (status ERROR), all its verdicts
-        are dropped and the next judge judges the whole round, while time is left.
+        """Judge a round of clips; the verdicts are in the order of the jobs.
 
         Args:
             check: called at least every POLL_S; an exception from it ends the judging and cancels open calls.
-            done: called in this thread with the index and verdict of every clip; immediately for the last judge, at
-                the end of the round for judges that have a fallback.
+            done: called in this thread with the index and verdict of every clip.
             within_s: clips without a verdict after this time get one with status ERROR; None: no limit.
             round_number: of these clips in the audit log.
-            by: the id of the only judge to ask; empty: all, in their order.
-
-        Raises:
-            ValueError: there is no judge of this id.
         """
-        slots = [slot for slot in self._slots if by in ("", slot.judge_id)]
-        if not slots:
-            raise ValueError(f"there is no judge {by!r} to ask, only {', '.join(self.judge_ids)}")
         deadline = None if within_s is None else time.monotonic() + within_s
-        lost = list[str]()
-        for slot in slots:
+        for slot in self._slots.values():
             if isinstance(slot.agent, AuditedAgent):
                 slot.agent.round_number = round_number
-            verdicts_by_index = dict[int, Verdict]()
-            budget = _FallbackBudget(len(jobs), deadline) if slot is not slots[-1] else None
-            on_verdict = done if budget is None else verdicts_by_index.__setitem__
-            # one clip tests whether the judge answers again and lets its circuit breaker close
-            ahead = int(slot.failed_last_round and budget is not None)
-            verdicts = self._round(slot, jobs[:ahead], 0, deadline, check, on_verdict, budget)
-            verdicts += self._round(slot, jobs[ahead:], ahead, deadline, check, on_verdict, budget)
-            slot.failed_last_round = budget is not None and budget.over
-            if budget is None or not budget.over:
-                break
-            lost.append(f"{slot.judge_id} did not answer: {budget.reason}")
-        for index, verdict in verdicts_by_index.items():
-            done(index, verdict)
-        self._used = slot
-        self.fallen_back = f"{'; '.join(lost)}; the round went to {slot.judge_id}" if lost else ""
-        return verdicts
+        futures = {self.submit(job, deadline): index for index, job in enumerate(jobs)}
+        open_ = set(futures)
+        try:
+            while open_:
+                check()
+                finished, open_ = wait(open_, POLL_S, FIRST_COMPLETED)
+                for future in finished:
+                    done(futures[future], future.result())
+        finally:
+            for future in open_:
+                future.cancel()
+        return [future.result() for future in futures]
 
     def refresh_health(self) -> None:
         """Request the judge's health, at most every HEALTH_S and without waiting; `health` is the newest answer."""
         idle = self._health_request is None or self._health_request.done()
         if idle and not self._loop.is_closed() and time.monotonic() - self._health_asked_s >= HEALTH_S:
             self._health_asked_s = time.monotonic()
-            self._health_request = self._run(self._ask_health(self._slots[0]))
+            self._health_request = self._run(self._ask_health(self._first))
 
     def close(self) -> None:
         """Cancel open calls and end the thread."""
@@ -261,9 +226,21 @@ class JudgeService:
 
     # internals
 
-    def _make_slots(self, rubric: Rubric) -> list[_JudgeSlot]:
-        check_judge(self.settings)
-        return [self._make_slot(settings, rubric) for settings in judges_of(self.settings)]
+    @property
+    def _first(self) -> _JudgeSlot:
+        return next(iter(self._slots.values()))
+
+    def _slot_of(self, task: str) -> _JudgeSlot:
+        return self._slots.get(task, self._first)
+
+    def _make_slots(self, rubric: Rubric) -> dict[str, _JudgeSlot]:
+        """By task; tasks with equal settings share one."""
+        made: dict[str, _JudgeSlot] = {}
+        keys = {task: settings.model_dump_json() for task, settings in self._settings_of.items()}
+        for task, key in keys.items():
+            if key not in made:
+                made[key] = self._make_slot(self._settings_of[task], rubric)
+        return {task: made[key] for task, key in keys.items()}
 
     def _make_slot(self, settings: JudgeConfig, rubric: Rubric) -> _JudgeSlot:
         log = self._log
@@ -277,34 +254,12 @@ class JudgeService:
         opened = make_judge(settings, rubric, self._reads, partial(write_exchange, log), device=self._device)
         return _JudgeSlot(opened, AuditedAgent(opened.judge, rubric, log, **limits))
 
-    def _round(
-        self, slot: _JudgeSlot, jobs: Sequence[ClipJob], first: int, deadline: float | None, check: Callable[[], None],
-        done: Callable[[int, Verdict], None], budget: "_FallbackBudget | None",
-    ) -> list[Verdict]:
-        """The verdicts of one judge, incomplete when its budget is over. first: index of the first job."""
-        if budget is not None and budget.over:
-            return []
-        work = (self._judge_clip(slot.agent, job, deadline) for job in jobs)
-        futures = {self._run(each): index for index, each in enumerate(work, first)}
-        open_ = set(futures)
-        try:
-            while open_ and not (budget is not None and budget.over):
-                check()
-                finished, open_ = wait(open_, POLL_S, FIRST_COMPLETED)
-                for future in finished:
-                    done(futures[future], future.result())
-                    if budget is not None and not jobs[futures[future] - first].problem:
-                        budget.record(future.result(), alone=len(jobs) == 1)
-        finally:
-            for future in open_:
-                future.cancel()
-        return [future.result() for future in futures if future not in open_]
-
     def _run(self, work: Coroutine[Any, Any, T]) -> "Future[T]":
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
-    async def _judge_clip(self, agent: RewardAgent | AuditedAgent, job: ClipJob, deadline: float | None) -> Verdict:
-        problem = job.problem
+    async def _judge_clip(self, job: ClipJob, deadline: float | None) -> Verdict:
+        agent = self._slot_of(job.task.task_id).agent
+        problem = job.problem or self._refused.get(job.task.task_id, "")
         verdict = _unjudged(agent, job, self._seed, problem) if problem else await self._evaluate(agent, job, deadline)
         self.tally.add(verdict)
         return verdict
@@ -327,8 +282,24 @@ class JudgeService:
         for task in others:
             task.cancel()
         await asyncio.gather(*others, return_exceptions=True)
-        for slot in self._slots:
+        for slot in {id(slot): slot for slot in self._slots.values()}.values():
             await slot.opened.close()
+
+
+def _settings_by_task(
+    settings: JudgeConfig, tasks: Iterable[str]
+) -> tuple[dict[str, JudgeConfig], dict[str, str]]:
+    """The settings of each task's judge, and why a task has none. Raises ValueError: not one task has a judge."""
+    known: dict[str, JudgeConfig] = {}
+    refused: dict[str, str] = {}
+    for task in dict.fromkeys(tasks):
+        try:
+            known[task] = for_task(settings, task)
+        except ValueError as refusal:
+            refused[task] = str(refusal)
+    if refused and not known:
+        raise ValueError(next(iter(refused.values())))
+    return known or {"": settings}, refused
 
 
 def _unjudged(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int, reason: str) -> Verdict:

@@ -10,6 +10,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from wm_nodes.config.environments import NO_ENVIRONMENT
 from wm_nodes.config.load import (
     dump_config,
     judge_or_embedded,
@@ -23,8 +24,15 @@ from wm_nodes.config.schema import AGENT, JudgeConfig, RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.files import write_atomic
 from wm_nodes.launching.graph import Graph, GraphError, compose
-from wm_nodes.launching.saved_arguments import full_paths, keep_arguments, read_arguments, saved_config, take_up
-from wm_nodes.launching.scenarios import build_graph, parse_arguments, run_folder
+from wm_nodes.launching.saved_arguments import (
+    full_paths,
+    keep_arguments,
+    read_arguments,
+    saved_config,
+    settings_of,
+    take_up,
+)
+from wm_nodes.launching.scenarios import IMAGINED, REAL, build_graph, parse_arguments, run_folder
 
 
 def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None) -> dict[str, str]:
@@ -44,18 +52,18 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
     allowed += [str(Path(values["bag_uri"]).expanduser().absolute())] if scenario == "replay_offline" else []
     values["allowed_dirs"] = ":".join(allowed)  # the bag that the user names is one for goals, too
     given_config = values["config_file"]
-    judge = _judge_settings(values)
+    changes = _judge_settings(values) | settings_of(values.get("set", ""))
     if "video_preset" in values:
-        return _resolve_video(values, run_dir, judge)
-    if given_config and judge:
-        raise GraphError(f"config_file is given, so {', '.join(judge)} belong into it; leave the judge's arguments out")
+        return _resolve_video(values, run_dir, changes)
+    if given_config and changes:
+        raise GraphError(f"config_file is given, so {', '.join(changes)} belong into it; leave these arguments out")
     if given_config:
         values["config_file"] = str(Path(given_config).expanduser().absolute())
         config = load_config(values["config_file"])
     else:
         seed = values.get("seed", "")
         config = load_config(
-            values["preset"], {"task": values["task"]} | ({"seed": int(seed)} if seed.isdigit() else {}) | judge
+            values["preset"], {"task": values["task"]} | ({"seed": int(seed)} if seed.isdigit() else {}) | changes
         )
         if values.get("reward") == "agent":
             config = config.model_copy(update={"judge": judge_or_embedded(config.judge)})
@@ -64,9 +72,11 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
         _check_agent(config, values)
     if values.get("num_envs") == "0":
         values["num_envs"] = str(config.ppo.num_envs)
-    if "model_dir" in values:
+    if config.evaluation.environment == NO_ENVIRONMENT and "simulator" in values:
+        values["simulator"] = "false"
+    if "model_dir" in values and (values["model_dir"] or config.task or values.get("backend") in IMAGINED):
         values["model_dir"] = _model_dir(values["model_dir"], config.task)
-    if values.get("starts_file") == "":
+    if values.get("starts_file") == "" and values["model_dir"]:
         values["starts_file"] = str(Path(values["model_dir"]) / "starts.safetensors")
     if "bag_uri" in values:
         values["bag_uri"] = _bag_uri(values["bag_uri"], scenario, run_dir)
@@ -90,7 +100,7 @@ def _check_agent(config: RunConfig, values: Mapping[str, str]) -> None:
     from wm_nodes.judge.episode_reward import check_agent
 
     _check_judge(config.judge)
-    if values.get("backend") != "factory" and "num_envs" in values:
+    if values.get("backend") != REAL and "num_envs" in values:
         try:
             check_agent(config, trains="learner_ranks" in values)
         except ValueError as error:
@@ -106,13 +116,13 @@ def _check_judge(settings: JudgeConfig) -> None:
         raise GraphError(f"{error}; as arguments: judge:=<url> judge_model:=<name>") from None
 
 
-def _resolve_video(values: dict[str, str], run_dir: Path, judge: dict[str, Any]) -> dict[str, str]:
+def _resolve_video(values: dict[str, str], run_dir: Path, changes: dict[str, Any]) -> dict[str, str]:
     """Loop 2 has settings of its own (config/video.py); the world model gives the judge's position probe."""
 
     if values["reward"] not in ("", "agent"):
         raise GraphError(f"reward {values['reward']!r} is of policies; for the video model give agent or nothing")
     weights = reward_overrides(values["reward"] or None)
-    config = load_video_config(values["config_file"] or values["video_preset"], {**weights, **judge})
+    config = load_video_config(values["config_file"] or values["video_preset"], {**weights, **changes})
     if config.rewards.get(AGENT):
         config = config.with_values(judge=judge_or_embedded(config.judge))
         _check_judge(config.judge)

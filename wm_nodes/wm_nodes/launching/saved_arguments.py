@@ -15,6 +15,7 @@ from wm_nodes.config.load import (
     judge_overrides,
     load_config,
     load_video_config,
+    parse_override,
     reward_overrides,
 )
 from wm_nodes.config.saved import DEVICE, Load, differs, load_saved, refuse_differences, with_device
@@ -25,7 +26,7 @@ from wm_nodes.launching.scenarios import parse_arguments, scenario_of
 FILE = "launch.json"
 PRESETS = ("preset", "video_preset")
 JUDGE = ("judge", "judge_model", "judge_key_env", "rubric")
-SETTINGS = (*PRESETS, "config_file", "task", *JUDGE)
+SETTINGS = (*PRESETS, "config_file", "task", "set", *JUDGE)
 """Arguments that the saved configuration stands for."""
 NOT_KEPT = (
     "run_dir", "allowed_dirs", "domain_id", "discovery_range", "python", "log_level", "executor", "autostart",
@@ -43,6 +44,11 @@ ARGUMENT_OF = {
     "judge.model": "judge_model", "judge.api_key_env": "judge_key_env", "judge.rubric": "rubric",
 }
 """Settings that an argument of another name stands for."""
+
+
+def settings_of(text: str) -> dict[str, Any]:
+    """The dotted settings of the argument `set`. Raises ConfigError: a part is not section.key=value."""
+    return dict(parse_override(part) for part in text.split(";") if part.strip())
 
 
 def saved_config(scenario: str, run_dir: Path) -> Path:
@@ -77,7 +83,7 @@ def _compare(saved: Path, given: Mapping[str, str], by_name: set[str]) -> tuple[
     """The saved configuration, and in what the given settings, of those that were not compared by name, differ."""
     load: Load[Any] = load_config if saved.name == "config.yaml" else load_video_config
     changes = judge_overrides(*(given.get(name, "") for name in JUDGE))
-    changes |= {"task": given["task"]} if given.get("task") else {}
+    changes |= settings_of(given.get("set", "")) | ({"task": given["task"]} if given.get("task") else {})
     file = next((given[name] for name in ("config_file", *PRESETS) if given.get(name) and name not in by_name), None)
     file = None if file == str(saved) else file
     if given.get("seed", "").isdigit() and (file or "seed" not in by_name):

@@ -12,12 +12,14 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from wm_nodes.config.tasks import task_names
+from wm_nodes.config.tasks import default_task, task_names
 from wm_nodes.launching.graph import Graph, GraphError, NodeSpec, ParameterValue
 
 TRUTHS = ("true", "false")
 IMAGINED = ("world_model", "video_model")
 """Environments that a model imagines, which is also where reward `endogenous` comes from."""
+REAL = "environment"
+"""The environment of environment.factory."""
 ENVIRONMENT_TOPICS = ("env/spec", "env/image", "env/transition", "env/goal", "episode")
 GRAPH_TOPICS = (
     *ENVIRONMENT_TOPICS, "reward", "action", "policy/version", "reward/summary", "learner/metrics", "run/state",
@@ -41,7 +43,10 @@ class LaunchArgument:
 
 ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("preset", "cpu", "Settings to start from, when config_file is empty: a name or a .yaml file"),
-    LaunchArgument("task", "push_cube", "Task, when config_file is empty", task_names()),
+    LaunchArgument("task", default_task(), "Task, when config_file is empty; empty: none, the spec of the model or "
+                   "the environment says everything", ("", *task_names())),
+    LaunchArgument("set", "", "Settings over those of the preset, when config_file is empty: section.key=value (YAML), "
+                   "separated by semicolons"),
     LaunchArgument("config_file", "", "Resolved configuration (YAML) of an earlier run; empty: from preset and task"),
     LaunchArgument("run_dir", "", "Folder for settings, weights, bags and logs; an existing one goes on as it was "
                    "begun; empty: runs/<time>-<scenario>"),
@@ -57,12 +62,8 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("starts_file", "", "Frames to imagine from; empty: starts.safetensors in model_dir"),
     LaunchArgument("first_frames_file", "", "First frames with reset seeds, for the exploit meter; empty: starts_file"),
     LaunchArgument("initial_policy", "", "Weights (safetensors) that the policy and the learner start from"),
-    LaunchArgument("backend", "world_model", "What the environment node steps",
-                   (*IMAGINED, "maniskill", "factory")),
-    LaunchArgument("backend_factory", "", "module:callable(config, num_envs, seed) -> Environment (backend factory)"),
-    LaunchArgument("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir"),
-    LaunchArgument("reward_factory", "", "module:callable(config) -> RewardModel instead of `reward`"),
-    LaunchArgument("learner_factory", "", "module:callable(policy, config) -> Learner instead of PPO"),
+    LaunchArgument("backend", "world_model", "What the environment node steps; environment: the one of the setting "
+                   "environment.factory", (*IMAGINED, REAL)),
     LaunchArgument("params_file", "", "ROS parameter file (YAML) for all nodes; it wins over the other arguments"),
     LaunchArgument("mode", "lockstep", "Who keeps time: the policy's steps, or the environment's clock",
                    ("lockstep", "asynchronous")),
@@ -74,8 +75,9 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("judge_key_env", "", "reward:=agent: environment variable with the server's key; empty: none"),
     LaunchArgument("rubric", "", "reward:=agent: rubric pack, a name or a .yaml file; empty: the settings'"),
     LaunchArgument("num_envs", "0", "Environments stepped together; 0: ppo.num_envs of the configuration"),
-    LaunchArgument("simulator_envs", "4", "Environments of the simulator that evaluates"),
-    LaunchArgument("simulator", "true", "Also start the simulator and the evaluation node", TRUTHS),
+    LaunchArgument("simulator_envs", "4", "Environments that the policy is measured in (evaluation.environment)"),
+    LaunchArgument("simulator", "true", "Also start them and the evaluation node; not where evaluation.environment "
+                   "is none", TRUTHS),
     LaunchArgument("seed", "0", "Root seed of the environments"),
     LaunchArgument("learner_ranks", "1", "Learner processes under torchrun"),
     LaunchArgument("record", "true", "Also start the recorder", TRUTHS),
@@ -101,8 +103,9 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
 
 _BY_NAME = {argument.name: argument for argument in ARGUMENTS}
 _COMMON = (
-    "preset", "task", "config_file", "run_dir", "allowed_dirs", "namespace", "executor", "autostart", "use_sim_time",
-    "log_level", "respawn", "memory_limit_gib", "compose", "domain_id", "discovery_range", "python", "params_file",
+    "preset", "task", "set", "config_file", "run_dir", "allowed_dirs", "namespace", "executor", "autostart",
+    "use_sim_time", "log_level", "respawn", "memory_limit_gib", "compose", "domain_id", "discovery_range", "python",
+    "params_file",
 )
 
 
@@ -185,10 +188,6 @@ def _environment(arguments: Mapping[str, str], backend: str, *, count: str = "nu
         "seed": _integer(arguments, "seed", 0),
         "mode": arguments.get("mode", "lockstep") if not below else "lockstep",
     }
-    if backend == "factory":
-        if not arguments["backend_factory"]:
-            raise GraphError("backend:=factory needs backend_factory:=module:callable")
-        parameters["backend_factory"] = arguments["backend_factory"]
     if backend in IMAGINED:
         folder = f"{backend.removeprefix('world_')}_dir"
         if not arguments[folder]:
@@ -200,7 +199,7 @@ def _environment(arguments: Mapping[str, str], backend: str, *, count: str = "nu
 def _simulator_and_evaluation(arguments: Mapping[str, str]) -> list[NodeSpec]:
     evaluation = {**_weights(arguments), "env_namespace": "sim"}
     return [
-        _environment(arguments, "maniskill", count="simulator_envs", below="sim"),
+        _environment(arguments, "evaluation", count="simulator_envs", below="sim"),
         _node(arguments, "evaluation", evaluation),
     ]
 
@@ -215,8 +214,7 @@ def _recorder(arguments: Mapping[str, str], *, simulator: bool = False) -> list[
 
 
 def _weights(arguments: Mapping[str, str]) -> dict[str, ParameterValue]:
-    names = ("model_dir", "initial_policy", "policy_factory")
-    return {name: arguments[name] for name in names}
+    return {name: arguments[name] for name in ("model_dir", "initial_policy")}
 
 
 def _rollout_nodes(arguments: Mapping[str, str], backend: str, consumers: tuple[str, ...] = ()) -> list[NodeSpec]:
@@ -227,10 +225,7 @@ def _rollout_nodes(arguments: Mapping[str, str], backend: str, consumers: tuple[
     awaited = ["environment", "reward_evaluator", *(node.name for node in recorder), *consumers]
     return [
         _environment(arguments, backend),
-        _node(
-            arguments, "reward_evaluator",
-            {"reward": reward, "reward_factory": arguments["reward_factory"], "model_dir": arguments["model_dir"]},
-        ),
+        _node(arguments, "reward_evaluator", {"reward": reward, "model_dir": arguments["model_dir"]}),
         _node(arguments, "policy", {**policy, "await_nodes": awaited}),
         *recorder,
     ]
@@ -238,7 +233,7 @@ def _rollout_nodes(arguments: Mapping[str, str], backend: str, consumers: tuple[
 
 def _online_training(arguments: Mapping[str, str]) -> Graph:
     ranks = _integer(arguments, "learner_ranks", 1, 1024)
-    learner = _weights(arguments) | {"learner_factory": arguments["learner_factory"]}
+    learner = _weights(arguments)
     if arguments["backend"] in IMAGINED:
         learner["starts_file"] = arguments["first_frames_file"] or arguments["starts_file"]
     if arguments["backend"] == "video_model":
@@ -261,8 +256,7 @@ def _replay_offline(arguments: Mapping[str, str]) -> Graph:
     trains = arguments["train"] == "true"
     player = _node(arguments, "player", {"bag_uri": arguments["bag_uri"], "play_at_start": not trains, "rate": rate})
     source = {"replay_rate": rate, "replay_at_start": arguments["bag_uri"] if trains else ""}
-    learner = {**_weights(arguments), "learner_factory": arguments["learner_factory"], **source}
-    return Graph("replay_offline", (player, _node(arguments, "learner", learner)))
+    return Graph("replay_offline", (player, _node(arguments, "learner", {**_weights(arguments), **source})))
 
 
 def _evaluate(arguments: Mapping[str, str]) -> Graph:
@@ -311,14 +305,13 @@ class Scenario:
 _JUDGE = ("judge", "judge_model", "judge_key_env", "rubric")
 _TRAINING = (
     *_COMMON, "model_dir", "starts_file", "first_frames_file", "initial_policy", "backend", "video_model_dir",
-    "reward", "num_envs", "simulator_envs", "simulator", "seed", "learner_ranks", "record", "bag_uri",
-    "backend_factory", "policy_factory", "learner_factory", "reward_factory", *_JUDGE,
+    "reward", "num_envs", "simulator_envs", "simulator", "seed", "learner_ranks", "record", "bag_uri", *_JUDGE,
 )
 _ROLLOUT = (
     "model_dir", "starts_file", "initial_policy", "backend", "video_model_dir", "mode", "reward", "num_envs", "seed",
-    "record", "bag_uri", "backend_factory", "policy_factory", "reward_factory", *_JUDGE,
+    "record", "bag_uri", *_JUDGE,
 )
-_EVALUATE = (*_COMMON, "model_dir", "initial_policy", "policy_factory", "simulator_envs", "seed", "record", "bag_uri")
+_EVALUATE = (*_COMMON, "model_dir", "initial_policy", "simulator_envs", "seed", "record", "bag_uri")
 
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
@@ -327,8 +320,7 @@ SCENARIOS: dict[str, Scenario] = {
                  _online_training),
         Scenario("rollout_record", "Let a policy act and record it", (*_COMMON, *_ROLLOUT), _rollout_record),
         Scenario("replay_offline", "Play a bag; the learner trains from what is played",
-                 (*_COMMON, "model_dir", "initial_policy", "policy_factory", "learner_factory", "bag_uri", "rate",
-                  "train"), _replay_offline),
+                 (*_COMMON, "model_dir", "initial_policy", "bag_uri", "rate", "train"), _replay_offline),
         Scenario("evaluate", "Measure a policy in the simulator", _EVALUATE, _evaluate),
         Scenario("world_model_rl", "Post-train the video model by GRPO on clips that it samples",
                  (*(name for name in _COMMON if name not in ("preset", "task", "compose")), "model_dir",

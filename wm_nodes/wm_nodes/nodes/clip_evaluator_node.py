@@ -16,7 +16,7 @@ from wm_msgs.msg import ClipScores, ClipVerdict
 from wm_nodes.config.load import judge_or_embedded, load_video_config
 from wm_nodes.config.schema import AGENT
 from wm_nodes.core.device import compute_device
-from wm_nodes.core.named_files import BUFFER, NamedFiles, shown
+from wm_nodes.core.named_files import BUFFER, NamedFiles
 from wm_nodes.judge.agent.contract import check_one_judge
 from wm_nodes.judge.agent.types import GATED
 from wm_nodes.judge.agent.verdict import Verdict
@@ -81,25 +81,19 @@ class ClipEvaluatorNode(ManagedNode):
         if self._agent is not None:
             self._agent.update_diagnostics()
 
-    def _evaluate(self, work: Work) -> EvaluateClips.Result:
+    def _evaluate(self, work: Work, result: EvaluateClips.Result) -> None:
         goal: EvaluateClips.Goal = work.request
-        result = EvaluateClips.Result(termination_reason=EvaluateClips.Result.FINISHED)
-        try:
-            began = time.perf_counter()
-            buffer = read_buffer(self._files, goal.buffer_uri, goal.sha256)
-            frames = self._generator.folder.codec.decode(buffer.rollout.latents)
-            verdicts: list[Verdict] = []
-            if self._agent is not None:
-                verdicts, result.verdicts = self._judge_clips(self._agent, work, buffer, frames)
-            result.scores = self._score(buffer, frames, verdicts, goal.sha256)
-            work.check()
-            result.scores.eval_s = time.perf_counter() - began
-            self._scores.publish(result.scores)
-            self.diagnostics.latency("evaluate", result.scores.eval_s)
-        except (RolloutBufferError, ValueError, OSError) as error:
-            result.termination_reason, result.message = EvaluateClips.Result.FAILED, str(error)
-            self.say_failed_goal(f"{shown(goal.buffer_uri)} not judged: {error}")
-        return result
+        began = time.perf_counter()
+        buffer = read_buffer(self._files, goal.buffer_uri, goal.sha256)
+        frames = self._generator.folder.codec.decode(buffer.rollout.latents)
+        verdicts: list[Verdict] = []
+        if self._agent is not None:
+            verdicts, result.verdicts = self._judge_clips(self._agent, work, buffer, frames)
+        result.scores = self._score(buffer, frames, verdicts, goal.sha256)
+        work.check()
+        result.scores.eval_s = time.perf_counter() - began
+        self._scores.publish(result.scores)
+        self.diagnostics.latency("evaluate", result.scores.eval_s)
 
     def _judge_clips(
         self, agent: JudgeServices, work: Work, buffer: RolloutBuffer, frames: torch.Tensor

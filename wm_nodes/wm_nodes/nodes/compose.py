@@ -73,9 +73,9 @@ def _rewarded(nodes: Sequence[Any]) -> Callable[[], Environment | None]:
             if isinstance(node, EnvironmentNode):
                 served = node.served
             elif node.get_name() == "reward_evaluator" and (
-                node.param("reward") != "endogenous" or node.param("reward_factory")
+                node.param("reward") != "endogenous" or node.run_config().reward.factory
             ):
-                reward = node.param("reward_factory") or node.param("reward")
+                reward = node.run_config().reward.factory or node.param("reward")
                 raise ValueError(f"{DEVICE_ROLLOUTS} has the endogenous reward, and the reward evaluator's is {reward}")
         return None if served is None else served.environment
 

@@ -18,6 +18,8 @@ from std_msgs.msg import Bool
 
 from wm_msgs.msg import ActionBatch, EpisodeEvent, ErrorCode
 from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
+from wm_nodes.core.errors import WireError
+from wm_nodes.core.lockstep import Goals, LockStep
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.nodes.environment.asynchronous import AsynchronousEnvironment
@@ -26,12 +28,13 @@ from wm_nodes.nodes.environment.image_views import PARAMS as VIEW_PARAMS
 from wm_nodes.nodes.environment.image_views import ImageViews
 from wm_nodes.nodes.environment.lockstep import LockstepEnvironment, StampClock
 from wm_nodes.nodes.factories import BACKENDS, make_environment
+from wm_nodes.recording.messages import tiles_of
 from wm_nodes.ros import calls, convert, diagnostics
 from wm_nodes.ros.flow_control import ProducerCredits
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
 from wm_nodes.ros.spin import run_node
-from wm_nodes.ros.wire import EpisodeNote, Goals, Transition, WireError
+from wm_nodes.ros.wire import EpisodeNote
 
 MODES = ("lockstep", "asynchronous")
 
@@ -39,9 +42,8 @@ MAX_MOSAIC_BYTES = 96 * 2**20
 """Largest env/image that was tried: it arrives, in about a second. Writer and readers keep up to 32 of them."""
 
 PARAMS = (
-    Param("backend", "world_model", "What is stepped", read_only=True, choices=BACKENDS),
-    Param("backend_factory", "", "module:callable(config, num_envs, seed) -> Environment, for backend factory; the "
-          "plug-in point for real robots", read_only=True),
+    Param("backend", "world_model", "What is stepped: a model, or by the configuration environment.factory, or "
+          "evaluation.environment", read_only=True, choices=BACKENDS),
     Param("model_dir", "", "World-model folder, for backend world_model", read_only=True),
     Param("video_model_dir", "", "Folder of a video model that is stepped, for backend video_model", read_only=True),
     Param("starts_file", "", "starts.safetensors: real first frames, for an imagining backend", read_only=True),
@@ -77,8 +79,7 @@ class EnvironmentNode(ManagedNode):
         environment = make_environment(
             str(self.param("backend")), self.run_config(), num_envs=int(self.param("num_envs")),
             seed=int(self.param("seed")), model_dir=str(self.param("model_dir")),
-            starts_file=str(self.param("starts_file")), factory=str(self.param("backend_factory")),
-            video_model_dir=str(self.param("video_model_dir")),
+            starts_file=str(self.param("starts_file")), video_model_dir=str(self.param("video_model_dir")),
         )
         if (size := mosaic_bytes(environment.spec)) > MAX_MOSAIC_BYTES:
             environment.close()
@@ -160,7 +161,7 @@ class EnvironmentNode(ManagedNode):
     def goals(self, goals: Goals) -> None:
         self._send(lambda: self._goals.publish(convert.goal_msg(goals, self._spec)))
 
-    def transition(self, transition: Transition) -> None:
+    def transition(self, transition: LockStep) -> None:
         self._send(lambda: self._transitions.publish(convert.transition_msg(transition)))
 
     def episode(self, note: EpisodeNote) -> None:
@@ -200,7 +201,7 @@ class EnvironmentNode(ManagedNode):
         except WireError as error:
             return self._refusal(response, error, "step")
         self.diagnostics.latency("step", reply.step_s)
-        return calls.fill_step_response(response, reply, self._spec, self._shown)
+        return calls.fill_response(response, reply, self._spec, self._shown)
 
     def _on_reset(self, request: ResetBatch.Request, response: ResetBatch.Response) -> ResetBatch.Response:
         try:
@@ -209,11 +210,13 @@ class EnvironmentNode(ManagedNode):
             reply = served.reset(command) if self._asynchronous is None else self._asynchronous.reset(command)
         except WireError as error:
             return self._refusal(response, error, "reset")
-        return calls.fill_reset_response(response, reply, self._spec, self._shown)
+        return calls.fill_response(response, reply, self._spec, self._shown)
 
     def _on_get_spec(self, request: GetEnvSpec.Request, response: GetEnvSpec.Response) -> GetEnvSpec.Response:
-        if not self.active:
-            return convert.fill_error(response, self._not_active())
+        try:
+            self.require_active()
+        except WireError as error:
+            return convert.fill_error(response, error)
         response.spec = convert.spec_msg(self._spec, self.get_clock().now().nanoseconds)
         response.spec.session = self.session
         return response
@@ -259,16 +262,12 @@ class EnvironmentNode(ManagedNode):
         self.served.end_episodes(EpisodeEvent.REASON_ESTOP)
 
     def _ready(self) -> LockstepEnvironment:
-        if not self.active or self.served is None:
-            raise self._not_active()
+        self.require_active()
+        assert self.served is not None  # while it is active
         return self.served
 
-    def _not_active(self) -> WireError:
-        return WireError(ErrorCode.NOT_ACTIVE, "the environment node is not active; activate it first")
-
     def _require_credit(self) -> None:
-        if not self.active:
-            raise self._not_active()
+        self.require_active()
         next_seq = self._transitions.next_seq
         blocking = self._credits.blocking_consumers(next_seq)
         if not blocking:
@@ -297,7 +296,7 @@ class EnvironmentNode(ManagedNode):
 
 def mosaic_bytes(spec: EnvironmentSpec) -> int:
     """Bytes of one env/image: all environments' tiles, empty ones included."""
-    height, width = convert.tiles_of(spec).mosaic_shape
+    height, width = tiles_of(spec).mosaic_shape
     return height * width * spec.channels
 
 

@@ -16,13 +16,10 @@ from wm_nodes.ros.clients import RosEnvironmentClient
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.spin import run_node
-from wm_nodes.ros.wire import PeerLost, WireError
 from wm_nodes.ros.worker import Work
 
 PARAMS = (
     Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
-    Param("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir",
-          read_only=True),
     Param("initial_policy", "", "Weights (safetensors) for goals without version and file, before any announcement",
           read_only=True),
     Param("env_namespace", "sim", "Relative namespace of the environment node to evaluate in", read_only=True),
@@ -42,9 +39,7 @@ class EvaluationNode(ManagedNode):
 
     def configure(self) -> None:
         self._config = self.run_config()
-        self._holder = PolicyHolder(
-            make_policy(self._config, str(self.param("model_dir")), str(self.param("policy_factory")))
-        )
+        self._holder = PolicyHolder(make_policy(self._config, str(self.param("model_dir"))))
         self._files = named_files(self, str(self.param("initial_policy")))
         self._newest: PolicyVersion | None = None
         self._environment = RosEnvironmentClient(
@@ -59,35 +54,26 @@ class EvaluationNode(ManagedNode):
     def _on_version(self, message: PolicyVersion) -> None:
         self._newest = message
 
-    def _evaluate(self, work: Work) -> Evaluate.Result:
+    def _evaluate(self, work: Work, result: Evaluate.Result) -> None:
         goal: Evaluate.Goal = work.request
-        result = Evaluate.Result(termination_reason=Evaluate.Result.FINISHED)
-        try:
-            if not (1 <= goal.episodes <= MAX_EPISODES and goal.seed + goal.episodes <= 2**63):
-                raise ValueError(
-                    f"episodes {goal.episodes} from seed {goal.seed}: ask for 1 to {MAX_EPISODES}, of seeds below 2^63"
-                )
-            result.policy_version = self._load(goal)
-            environment = RemoteEnvironment(
-                self._environment, work.check, timeout_s=float(self.param("handshake_timeout_s")),
-                behaviour=goal.behaviour or "policy", policy_version=result.policy_version,
+        if not (1 <= goal.episodes <= MAX_EPISODES and goal.seed + goal.episodes <= 2**63):
+            raise ValueError(
+                f"episodes {goal.episodes} from seed {goal.seed}: ask for 1 to {MAX_EPISODES}, of seeds below 2^63"
             )
+        result.policy_version = self._load(goal)
+        environment = RemoteEnvironment(
+            self._environment, work.check, timeout_s=float(self.param("handshake_timeout_s")),
+            behaviour=goal.behaviour or "policy", policy_version=result.policy_version,
+        )
 
-            def report(done: int, successes: int) -> None:
-                work.feedback(Evaluate.Feedback(episodes_done=done, success_rate=successes / max(done, 1)))
+        def report(done: int, successes: int) -> None:
+            work.feedback(Evaluate.Feedback(episodes_done=done, success_rate=successes / max(done, 1)))
 
-            evaluation = evaluate(
-                self._holder.policy, environment, int(goal.episodes), int(goal.seed), goal.deterministic,
-                on_progress=report,
-            )
-            self._fill(result, evaluation, self._config.reward.sparse_weight)
-        except PeerLost as error:
-            result.termination_reason, result.message = Evaluate.Result.PEER_LOST, f"the environment is lost: {error}"
-        except (WireError, ValueError) as error:
-            result.termination_reason, result.message = Evaluate.Result.FAILED, str(error)
-        if result.message:
-            self.say_failed_goal(result.message)
-        return result
+        evaluation = evaluate(
+            self._holder.policy, environment, int(goal.episodes), int(goal.seed), goal.deterministic,
+            on_progress=report,
+        )
+        self._fill(result, evaluation, self._config.reward.sparse_weight)
 
     def _load(self, goal: Evaluate.Goal) -> int:
         """Load the weights the goal names; return their version (0 for a file)."""

@@ -17,40 +17,39 @@ from wm_msgs.msg import EnvSpec, ErrorCode, RewardBatch, TransitionBatch
 from wm_msgs.srv import GetWeights, SaveCheckpoint
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import AGENT
+from wm_nodes.core.errors import WireError
+from wm_nodes.core.lockstep import DroppedTransitions
 from wm_nodes.core.named_files import NamedFiles
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Environment, Rollout
 from wm_nodes.judge.episode_reward import check_horizon, unjudged_reason
 from wm_nodes.judge.service import TrainingPaused
-from wm_nodes.nodes.factories import existing, expected_spec, make_learner, make_policy, refuse_other
+from wm_nodes.nodes.factories import expected_spec, make_policy, refuse_other
 from wm_nodes.nodes.learner.device_rollouts import DeviceRollouts
 from wm_nodes.nodes.learner.meter import LearnerMeter
-from wm_nodes.nodes.learner.replay_assembler import ReplayAssembler
 from wm_nodes.nodes.learner.report import LearnerReport
 from wm_nodes.nodes.learner.rollout_assembler import RolloutAssembler
 from wm_nodes.nodes.learner.rollout_sources import BagRollouts, LiveRollouts, ReplayedRollouts, RolloutSource, bag_paths
 from wm_nodes.nodes.learner.training_node import TrainingNode, run_learner
+from wm_nodes.nodes.policy.weights import load_initial
+from wm_nodes.policy_rl.factories import make_learner
 from wm_nodes.policy_rl.rollouts import Canceled, TensorRollout
-from wm_nodes.policy_rl.training_run import DroppedTransitions, PolicyTraining
+from wm_nodes.policy_rl.training_run import PolicyTraining
+from wm_nodes.recording.messages import images_of, time_ns
 from wm_nodes.recording.reader import read_spec
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import GuardedActionClient
 from wm_nodes.ros.params import COMMON, Param, named_files
 from wm_nodes.ros.sequence_numbers import check_session
-from wm_nodes.ros.wire import WireError
 from wm_nodes.ros.worker import Work
 from wm_nodes.training.ranks import Ranks, own_device
-from wm_nodes.training.weights import INLINE_LIMIT_BYTES, WeightsError, load_weights
+from wm_nodes.training.weights import INLINE_LIMIT_BYTES
 
 MAX_CHUNK_BYTES = 4 << 20
 
 PARAMS = (
     Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
-    Param("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir",
-          read_only=True),
-    Param("learner_factory", "", "module:callable(policy, config) -> Learner instead of PPO, see policy_rl.learner",
-          read_only=True),
     Param("initial_policy", "", "Weights (safetensors) to start from, where the run folder has no checkpoint",
           read_only=True),
     Param("resume", True, "Continue exactly from the run folder's checkpoint", read_only=True),
@@ -99,17 +98,14 @@ class LearnerNode(TrainingNode):
         self._spec_session = 0
         self._refused: WireError | None = None
         """Why the newest spec on env/spec cannot be trained from: it ends a goal that waits for its rollouts."""
-        self._expected_spec = expected_spec(
-            self._config, str(self.param("model_dir")), str(self.param("policy_factory"))
-        )
-        self._assembler, self._reward_name, self._max_episode_steps = RolloutAssembler(), "", 0
-        self._replayed = ReplayAssembler(self._withhold)
+        self._expected_spec = expected_spec(self._config, str(self.param("model_dir")))
+        self._assembler, self._reward_name, self._max_episode_steps = RolloutAssembler(self._withhold), "", 0
         self.listen("env/spec", self._on_spec, while_inactive=True)
         self.listen("env/image", self._on_image)
         self._credit = self.listen("env/transition", self._on_transition, credit=True)
         self.listen("reward", self._on_reward)
-        self.serve(SaveCheckpoint, "learner/save", self._on_save)
-        self.serve(GetWeights, "learner/get_weights", self._on_get_weights)
+        self.serve(SaveCheckpoint, "learner/save", self._on_save, counted="refused_saves")
+        self.serve(GetWeights, "learner/get_weights", self._on_get_weights, counted="refused_weights")
         self._rollouts = GuardedActionClient(self, RolloutAction, "rollout")
         self.own(self._rollouts.destroy)
         self._replay = GuardedActionClient(self, Replay, "replay")
@@ -209,7 +205,7 @@ class LearnerNode(TrainingNode):
             uris = [str(path) for path in bag_paths(goal.bag_uris, self._files)] if goal.bag_uris else []
             if uris:
                 self._refused = None
-            return ReplayedRollouts(self, check, progress, self._replayed, self._replay, uris, num_steps=num_steps)
+            return ReplayedRollouts(self, check, progress, self._assembler, self._replay, uris, num_steps=num_steps)
         if self._device_rollouts is not None:
             self._reward_name = "endogenous"
             return self._device_rollouts.begin(check, self._training, self._config, str(self.param("model_dir")))
@@ -279,11 +275,6 @@ class LearnerNode(TrainingNode):
         if self._credit is not None:
             self._credit.withhold(withheld)
 
-    @property
-    def _collecting(self) -> RolloutAssembler | ReplayAssembler | None:
-        """Where messages go now: the source that the running goal trains from; None between goals and with bags."""
-        return next((assembler for assembler in (self._assembler, self._replayed) if assembler.collecting), None)
-
     def _on_spec(self, message: EnvSpec) -> None:
         try:
             check_session(message.session)
@@ -300,88 +291,67 @@ class LearnerNode(TrainingNode):
             self._max_episode_steps = self._spec.max_episode_steps
             self._spec_session = message.session
             self._assembler.enter_session(message.session)
-            self._replayed.enter_session(message.session)
         except WireError as error:
             self._spec, self._refused = None, error
             self.diagnostics.count("refused_specs", level=diagnostics.ERROR, text=str(error))
 
     def _on_image(self, message: Image) -> None:
-        assembler = self._collecting
-        if self._spec is None or assembler is None:
-            return
-        assembler.put_image(convert.time_ns(message.header.stamp), convert.images_of(message, self._spec))
+        if self._spec is not None and self._assembler.collecting:
+            self._assembler.put_image(time_ns(message.header.stamp), images_of(message, self._spec))
 
     def _on_transition(self, message: TransitionBatch) -> None:
-        assembler = self._collecting
-        if self._spec is None or assembler is None:
-            return
-        check_session(message.session, self._spec_session)
-        assembler.put_transition(convert.transition_of(message, self._spec))
+        if self._spec is not None and self._assembler.collecting:
+            check_session(message.session, self._spec_session)
+            self._assembler.put_transition(convert.transition_of(message, self._spec))
 
     def _on_reward(self, message: RewardBatch) -> None:
-        assembler = self._collecting
-        if assembler is not None:
-            assembler.put_rewards(convert.rewards_of(message))
+        if self._assembler.collecting:
+            self._assembler.put_rewards(convert.rewards_of(message))
             self._reward_name = message.reward_name
 
     def _on_save(self, request: SaveCheckpoint.Request, response: SaveCheckpoint.Response) -> SaveCheckpoint.Response:
+        if self.training:
+            raise WireError(ErrorCode.BUSY, "training is running and saves after every update; cancel it or wait")
         try:
-            if self.training:
-                raise WireError(ErrorCode.BUSY, "training is running and saves after every update; cancel it or wait")
-            own = self._training.checkpoint
-            path = self._files.new(request.uri, "checkpoints") if request.uri else self.run_dir / own
+            path = self._files.new(request.uri, "checkpoints") if request.uri else (
+                self.run_dir / self._training.checkpoint
+            )
             self._training.save_checkpoint(path)
-            response.uri = str(path)
-        except (WireError, ValueError) as error:
-            refused = error if isinstance(error, WireError) else convert.file_error(error)
-            self.diagnostics.count("refused_saves", text=f"learner/save refused: {refused}")
-            return convert.fill_error(response, refused)
         except OSError as error:
             self.diagnostics.count("failed_saves", level=diagnostics.ERROR, text=f"checkpoint not written: {error}")
             return convert.fill_error(response, WireError(ErrorCode.IO_ERROR, f"checkpoint not written: {error}"))
-        response.version = self._training.progress.version
+        response.uri, response.version = str(path), self._training.progress.version
         return response
 
     def _on_get_weights(self, request: GetWeights.Request, response: GetWeights.Response) -> GetWeights.Response:
+        if not 0 < request.max_bytes <= MAX_CHUNK_BYTES:
+            raise WireError(
+                ErrorCode.OUT_OF_RANGE, f"max_bytes must lie in 1..{MAX_CHUNK_BYTES}, got {request.max_bytes}"
+            )
+        version = request.version or self._training.saved_version
         try:
-            if not 0 < request.max_bytes <= MAX_CHUNK_BYTES:
-                raise WireError(
-                    ErrorCode.OUT_OF_RANGE, f"max_bytes must lie in 1..{MAX_CHUNK_BYTES}, got {request.max_bytes}"
-                )
-            version = request.version or self._training.saved_version
             data = self._training.weights_of(version).data
-            if request.offset >= len(data):
-                raise WireError(
-                    ErrorCode.OUT_OF_RANGE,
-                    f"offset {request.offset} lies behind the end of {len(data)} bytes; begin again at 0",
-                )
         except OSError:
             text = f"policy version {request.version} is not in {self.run_dir / 'policies'}; ask for 0, the newest"
-            return self._refuse_weights(response, WireError(ErrorCode.NOT_FOUND, text))
-        except (WireError, ValueError) as error:
-            return self._refuse_weights(response, error if isinstance(error, WireError) else convert.file_error(error))
+            raise WireError(ErrorCode.NOT_FOUND, text) from None
+        if request.offset >= len(data):
+            raise WireError(
+                ErrorCode.OUT_OF_RANGE,
+                f"offset {request.offset} lies behind the end of {len(data)} bytes; begin again at 0",
+            )
         chunk = data[request.offset : request.offset + request.max_bytes]
         response.version, response.total, response.crc32 = version, len(data), zlib.crc32(chunk)
         response.data = convert.bytes_field(chunk)
         return response
-
-    def _refuse_weights(self, response: GetWeights.Response, refused: WireError) -> GetWeights.Response:
-        self.diagnostics.count("refused_weights", text=f"learner/get_weights refused: {refused}")
-        return convert.fill_error(response, refused)
 
 
 def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> PolicyTraining:
     """The run that a node's parameters describe."""
     config = load_config(str(values["config_file"]))
     config = config.with_values(device=str(own_device(config.device)))
-    policy = make_policy(config, str(values["model_dir"]), str(values["policy_factory"]))
-    if values["initial_policy"]:
-        path = existing(str(values["initial_policy"]), "initial_policy")
-        try:
-            load_weights(policy, path.read_bytes())
-        except WeightsError as error:
-            raise ValueError(f"initial_policy {path}: {error}") from None
-    learner = make_learner(policy, config, str(values["learner_factory"]), ranks)
+    policy = make_policy(config, str(values["model_dir"]))
+    load_initial(policy, str(values["initial_policy"]))
+    learner = make_learner(policy, config, ranks)
     return PolicyTraining(
         policy, learner, run_dir, resume=bool(values["resume"]), keep_versions=int(values["keep_versions"]),
         metadata={"tokenizer_sha256": policy.encoder.sha256}, ranks=ranks,

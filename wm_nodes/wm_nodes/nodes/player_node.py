@@ -19,6 +19,7 @@ from std_srvs.srv import Trigger
 from wm_msgs.action import Replay
 from wm_msgs.msg import Credit, ErrorCode
 from wm_msgs.srv import PlayNext, Seek, SetRate
+from wm_nodes.core.errors import WireError
 from wm_nodes.nodes.recorder.qos import message_class, offered_qos
 from wm_nodes.recording import Bag, BagError
 from wm_nodes.recording.cdr import session_and_seq
@@ -79,9 +80,10 @@ class PlayerNode(ManagedNode):
         self.listen("flow/credit", self._on_credit)
         for name, act in (("pause", Playback.pause), ("resume", Playback.resume)):
             self.serve(Trigger, f"player/{name}", partial(self._on_trigger, act))
-        self.serve(SetRate, "player/set_rate", self._on_set_rate)
-        self.serve(Seek, "player/seek", self._on_seek)
-        self.serve(PlayNext, "player/play_next", self._on_play_next)
+        serve = partial(self.serve, counted="refused_requests", code=ErrorCode.OUT_OF_RANGE)
+        serve(SetRate, "player/set_rate", self._on_set_rate)
+        serve(Seek, "player/seek", self._on_seek)
+        serve(PlayNext, "player/play_next", self._on_play_next)
         self._action = WorkerAction(self, Replay, "replay", self._replay)
 
     def activate(self) -> None:
@@ -233,19 +235,13 @@ class PlayerNode(ManagedNode):
             self.get_logger().error(f"playing failed: {error}")
             self.diagnostics.set_condition("playing", diagnostics.ERROR, str(error))
 
-    def _replay(self, work: Work) -> Replay.Result:
+    def _replay(self, work: Work, result: Replay.Result) -> None:
         began = time.monotonic()
-        try:
-            playback = self._open(work.request)
-            self._play(playback, work.request, work)
-        except (ValueError, OSError) as error:
-            self.say_failed_goal(f"replay failed: {error}")
-            return Replay.Result(termination_reason=Replay.Result.FAILED, message=str(error))
+        playback = self._open(work.request)
+        self._play(playback, work.request, work)
         if not self.active:
             raise Cancelled("deactivated")
-        return Replay.Result(
-            termination_reason=Replay.Result.FINISHED, messages=playback.messages, duration=time.monotonic() - began
-        )
+        result.messages, result.duration = playback.messages, time.monotonic() - began
 
     def _wait_for_credit(self, playback: Playback, data: bytes, check: Callable[[], None]) -> None:
         """Hold a transition back until every consumer has granted it, as the environment does."""
@@ -276,28 +272,21 @@ class PlayerNode(ManagedNode):
         return response
 
     def _on_set_rate(self, request: SetRate.Request, response: SetRate.Response) -> SetRate.Response:
-        return self._control(response, lambda playback: playback.set_rate(request.rate))
+        self._playing().set_rate(request.rate)
+        return response
 
     def _on_seek(self, request: Seek.Request, response: Seek.Response) -> Seek.Response:
-        return self._control(response, lambda playback: playback.seek(request.position))
+        self._playing().seek(request.position)
+        return response
 
     def _on_play_next(self, request: PlayNext.Request, response: PlayNext.Response) -> PlayNext.Response:
-        def play(playback: Playback) -> None:
-            response.played = playback.play_next(request.num_messages)
-
-        return self._control(response, play)
-
-    def _control(self, response: Any, act: Any) -> Any:
-        playback = self._playback
-        if playback is None:
-            response.error_code, response.message = ErrorCode.NOT_ACTIVE, "not playing; send a replay goal"
-            return response
-        try:
-            act(playback)
-        except BagError as error:
-            response.error_code, response.message = ErrorCode.OUT_OF_RANGE, str(error)
-            self.diagnostics.count("refused_requests", text=f"player request refused: {error}")
+        response.played = self._playing().play_next(request.num_messages)
         return response
+
+    def _playing(self) -> Playback:
+        if self._playback is None:
+            raise WireError(ErrorCode.NOT_ACTIVE, "not playing; send a replay goal")
+        return self._playback
 
 
 def _problem(connection: Connection) -> str:

@@ -14,14 +14,16 @@ from std_msgs.msg import Bool
 from wm_msgs.action import Rollout
 from wm_msgs.msg import ActionBatch, EnvSpec, ErrorCode, PolicyVersion
 from wm_msgs.srv import InferAction, LoadPolicy
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import UInt64Array
-from wm_nodes.nodes.factories import existing, expected_spec, make_policy, refuse_other
+from wm_nodes.nodes.factories import expected_spec, make_policy, refuse_other
 from wm_nodes.nodes.policy.asynchronous import AsynchronousPolicy
-from wm_nodes.nodes.policy.weights import PolicyHolder, read_weights
+from wm_nodes.nodes.policy.weights import PolicyHolder, load_initial, read_weights
 from wm_nodes.policy_rl.image_policy import PolicyOutput
 from wm_nodes.policy_rl.rollouts import action_noise, reset_seeds
 from wm_nodes.recording.layout import Tiles
+from wm_nodes.recording.messages import floats, images_of
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.clients import EnvironmentClient, LocalEnvironmentClient, RosEnvironmentClient
@@ -30,7 +32,7 @@ from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.qos import LIVE_ACTION
 from wm_nodes.ros.spin import run_node
-from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand, WireError
+from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand
 from wm_nodes.ros.worker import Work
 
 FEEDBACK_S = 0.5
@@ -38,8 +40,6 @@ HOLD_ARRIVES = Duration(seconds=1)
 
 PARAMS = (
     Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
-    Param("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir",
-          read_only=True),
     Param("initial_policy", "", "Weights (safetensors) to act with before the learner announces any", read_only=True),
     Param("step_timeout_s", 10.0, "Deadline of one env/step or env/reset, retries included", "s",
           minimum=0.1, maximum=600.0),
@@ -71,16 +71,12 @@ class PolicyNode(ManagedNode):
         self._estop = False
 
     def configure(self) -> None:
-        given = self.run_config(), str(self.param("model_dir")), str(self.param("policy_factory"))
-        self._holder, self._expected_spec = PolicyHolder(make_policy(*given)), expected_spec(*given)
+        given = self.run_config(), str(self.param("model_dir"))
+        policy = make_policy(*given)
+        load_initial(policy, str(self.param("initial_policy")))
+        self._holder, self._expected_spec = PolicyHolder(policy), expected_spec(*given)
         self._envs_per_start = given[0].ppo.envs_per_start
         self._files = named_files(self, str(self.param("initial_policy")))
-        if self.param("initial_policy"):
-            path = existing(str(self.param("initial_policy")), "initial_policy")
-            try:
-                self._holder.load(path.read_bytes(), 0)
-            except WireError as error:
-                raise ValueError(f"initial_policy {path}: {error}") from None
         self._spec: EnvironmentSpec | None = None
         self._announced: PolicyVersion | None = None
         self._last_reply: Reply | None = None
@@ -99,8 +95,8 @@ class PolicyNode(ManagedNode):
         self.listen("safety/estop", self._on_estop, while_inactive=True)
         self.listen("env/spec", self._on_spec, while_inactive=True)
         self.listen("policy/version", self._on_version, while_inactive=True)
-        self.serve(InferAction, "policy/infer", self._on_infer)
-        self.serve(LoadPolicy, "policy/load", self._on_load)
+        self.serve(InferAction, "policy/infer", self._on_infer, counted="refused_infer", code=ErrorCode.BAD_SHAPE)
+        self.serve(LoadPolicy, "policy/load", self._on_load, counted="refused_loads")
         self._rollouts = WorkerAction(self, Rollout, "rollout", self._rollout)
 
     def activate(self) -> None:
@@ -122,20 +118,12 @@ class PolicyNode(ManagedNode):
 
     # The rollout, in a worker thread.
 
-    def _rollout(self, work: Work) -> Rollout.Result:
-        result = Rollout.Result(termination_reason=Rollout.Result.FINISHED)
+    def _rollout(self, work: Work, result: Rollout.Result) -> None:
         try:
             self._act(work, result)
-        except PeerLost as error:
-            self._fail(result, Rollout.Result.PEER_LOST, f"the environment is lost: {error}")
-        except (WireError, ValueError) as error:
-            self._fail(result, Rollout.Result.FAILED, str(error))
-        return result
-
-    def _fail(self, result: Rollout.Result, reason: int, text: str) -> None:
-        result.termination_reason, result.message = reason, text
-        self._last_reply = None
-        self.say_failed_goal(text)
+        except (PeerLost, WireError, ValueError):
+            self._last_reply = None
+            raise
 
     def _act(self, work: Work, result: Rollout.Result) -> None:
         goal: Rollout.Goal = work.request
@@ -209,7 +197,7 @@ class PolicyNode(ManagedNode):
             raise WireError(
                 ErrorCode.SPEC_MISMATCH,
                 f"environment {spec.env_id} has {dims} state and action values, the policy {expected}; "
-                "name a policy of this robot in policy_factory",
+                "name a policy of this robot in policy.factory",
             )
         self._spec = spec
 
@@ -279,48 +267,36 @@ class PolicyNode(ManagedNode):
             self.diagnostics.set_condition("policy version", diagnostics.ERROR, str(error))
 
     def _on_infer(self, request: InferAction.Request, response: InferAction.Response) -> InferAction.Response:
-        try:
-            if not self.active:
-                raise WireError(ErrorCode.NOT_ACTIVE, "the policy node is not active; activate it first")
-            if self._spec is None:
-                raise WireError(ErrorCode.NOT_ACTIVE, "no env/spec seen yet; start an environment or replay a bag")
-            count = len(request.state) // self._holder.state_dim
-            spec = replace(self._spec, num_envs=max(count, 1))
-            states = convert.floats(request.state, (spec.num_envs, spec.state_dim), "state")
-            if not np.isfinite(states).all():
-                raise WireError(ErrorCode.NAN_INPUT, "state is NaN or infinite; send finite values")
-            tile = request.tile
-            if (tile.tile_height, tile.tile_width) != (spec.height, spec.width) or tile.rows * tile.cols < count:
-                raise WireError(
-                    ErrorCode.BAD_SHAPE,
-                    f"{tile.rows} x {tile.cols} tiles of {tile.tile_height} x {tile.tile_width} px do not hold {count} "
-                    f"of {spec.height} x {spec.width} px; lay them out as EnvSpec.tile does",
-                )
-            images = convert.images_of(
-                request.observation, spec, Tiles(tile.rows, tile.cols, tile.tile_height, tile.tile_width)
+        self.require_active()
+        if self._spec is None:
+            raise WireError(ErrorCode.NOT_ACTIVE, "no env/spec seen yet; start an environment or replay a bag")
+        count = len(request.state) // self._holder.state_dim
+        spec = replace(self._spec, num_envs=max(count, 1))
+        states = floats(request.state, (spec.num_envs, spec.state_dim), "state")
+        if not np.isfinite(states).all():
+            raise WireError(ErrorCode.NAN_INPUT, "state is NaN or infinite; send finite values")
+        tile = request.tile
+        if (tile.tile_height, tile.tile_width) != (spec.height, spec.width) or tile.rows * tile.cols < count:
+            raise WireError(
+                ErrorCode.BAD_SHAPE,
+                f"{tile.rows} x {tile.cols} tiles of {tile.tile_height} x {tile.tile_width} px do not hold {count} "
+                f"of {spec.height} x {spec.width} px; lay them out as EnvSpec.tile does",
             )
-            noise = None if request.deterministic else np.random.default_rng().standard_normal(
-                (spec.num_envs, spec.action_dim), np.float32
-            )
-            began = time.perf_counter()
-            output, version = self._holder.act(images, states, noise)
-            response.action = self._action_message(output, version, time.perf_counter() - began)
-            response.action.header.stamp = request.observation.header.stamp
-        except (WireError, ValueError) as error:
-            wire = error if isinstance(error, WireError) else WireError(ErrorCode.BAD_SHAPE, str(error))
-            self.diagnostics.count("refused_infer", text=f"policy/infer refused: {error}")
-            return convert.fill_error(response, wire)
+        tiles = Tiles(tile.rows, tile.cols, tile.tile_height, tile.tile_width)
+        images = images_of(request.observation, spec, tiles)
+        noise = None if request.deterministic else np.random.default_rng().standard_normal(
+            (spec.num_envs, spec.action_dim), np.float32
+        )
+        began = time.perf_counter()
+        output, version = self._holder.act(images, states, noise)
+        response.action = self._action_message(output, version, time.perf_counter() - began)
+        response.action.header.stamp = request.observation.header.stamp
         return response
 
     def _on_load(self, request: LoadPolicy.Request, response: LoadPolicy.Response) -> LoadPolicy.Response:
-        try:
-            if self._rollouts.busy:
-                raise WireError(ErrorCode.BUSY, "a rollout is running; cancel it or wait")
-            self._holder.load(read_weights(request.uri, self._files), 0, request.sha256)
-        except (WireError, ValueError) as error:
-            wire = error if isinstance(error, WireError) else WireError(ErrorCode.IO_ERROR, str(error))
-            self.diagnostics.count("refused_loads", text=f"policy/load refused: {error}")
-            return convert.fill_error(response, wire)
+        if self._rollouts.busy:
+            raise WireError(ErrorCode.BUSY, "a rollout is running; cancel it or wait")
+        self._holder.load(read_weights(request.uri, self._files), 0, request.sha256)
         response.version = self._holder.version
         return response
 

@@ -15,8 +15,8 @@ from std_srvs.srv import Trigger
 
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import StartRecording, StopRecording
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.files import write_atomic
-from wm_nodes.core.named_files import OutsideFolders
 from wm_nodes.nodes.recorder.qos import recorded_qos
 from wm_nodes.recording import BagError, RawBagWriter, RecordingError, topics
 from wm_nodes.recording import messages as m
@@ -28,7 +28,6 @@ from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.qos import TOPICS, GraphTopic, row_name
 from wm_nodes.ros.sequence_numbers import GapTracker
 from wm_nodes.ros.spin import run_node
-from wm_nodes.ros.wire import WireError
 
 FLUSH_S = 0.25
 QUIET_S = 0.3
@@ -76,7 +75,7 @@ class RecorderNode(ManagedNode):
             )
             self._names[name] = subscription.topic_name
             self.own(self.destroy_subscription, subscription)
-        self.serve(StartRecording, "recorder/start", self._on_start)
+        self.serve(StartRecording, "recorder/start", self._on_start, counted="refused_starts")
         self.serve(StopRecording, "recorder/stop", self._on_stop)
         for name in ("pause", "resume", "split"):
             self.serve(Trigger, f"recorder/{name}", partial(self._on_trigger, name))
@@ -247,20 +246,12 @@ class RecorderNode(ManagedNode):
     # Services.
 
     def _on_start(self, request: StartRecording.Request, response: StartRecording.Response) -> Any:
-        if not self.active:
-            response.error_code, response.message = ErrorCode.NOT_ACTIVE, "the recorder is not active; activate it"
-            return response
+        self.require_active()
+        uri = str(self._files.new(request.bag_uri, "bags")) if request.bag_uri else ""
         try:
-            uri = str(self._files.new(request.bag_uri, "bags")) if request.bag_uri else ""
             response.bag_uri = str(self._start(uri))
-        except OutsideFolders as error:
-            response.error_code, response.message = ErrorCode.OUT_OF_RANGE, str(error)
         except BagError as error:
-            response.error_code, response.message = ErrorCode.BUSY, str(error)
-        except (OSError, ValueError) as error:
-            response.error_code, response.message = ErrorCode.IO_ERROR, str(error)
-        if response.message:
-            self.diagnostics.count("refused_starts", text=f"not recording: {response.message}")
+            raise WireError(ErrorCode.BUSY, str(error)) from None
         return response
 
     def _on_stop(self, request: StopRecording.Request, response: StopRecording.Response) -> Any:

@@ -18,7 +18,7 @@ from wm_nodes.config.load import load_video_config
 from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.nodes.clip_evaluator_node import read_buffer
 from wm_nodes.nodes.learner.training_node import TrainingNode, run_learner
-from wm_nodes.ros import convert, diagnostics
+from wm_nodes.ros import diagnostics
 from wm_nodes.ros.actions import GuardedActionClient
 from wm_nodes.ros.clients import run_goal, same_process
 from wm_nodes.ros.endpoint_matching import StartBarrier
@@ -30,6 +30,7 @@ from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import BufferReport
 from wm_nodes.video_rl.reference_reward import attach_rewards
+from wm_nodes.video_rl.train import post_train
 from wm_nodes.video_rl.training_run import VideoRun
 from wm_nodes.video_rl.validation import alarm_text, validation_scores
 
@@ -95,17 +96,19 @@ class VideoLearnerNode(TrainingNode):
         else:
             self._start_barrier.wait(work)
             source = self._sample_buffers(work, count)
+        self._video.check = work.check
         with closing(source) as buffers:
-            for done, buffer in enumerate(buffers, 1):
-                invalid = len(buffer) - int(buffer.valid.sum())
-                if invalid:
-                    self.diagnostics.count("invalid_rewards", invalid, text=f"{invalid} clips without reward")
-                report = self._video.train(buffer, work.check)
+            for done, (_, report) in enumerate(post_train(self._video, map(self._count_invalid, buffers)), 1):
                 if report.skipped:
                     self.diagnostics.count("skipped_buffers", text="no group of a buffer has rewards that differ")
                 self.announce()
                 self._send_feedback(work, report, done, count)
                 self._warn_of_hacking()
+
+    def _count_invalid(self, buffer: RolloutBuffer) -> RolloutBuffer:
+        if invalid := len(buffer) - int(buffer.valid.sum()):
+            self.diagnostics.count("invalid_rewards", invalid, text=f"{invalid} clips without reward")
+        return buffer
 
     def _read_buffers(self, uris: Sequence[str]) -> Generator[RolloutBuffer]:
         for uri in uris:
@@ -200,10 +203,9 @@ def with_scores(buffer: RolloutBuffer, scores: ClipScores) -> RolloutBuffer:
     count, names = len(buffer), list(scores.names)
     if scores.num_clips != count or len(scores.total) != count or len(scores.values) != count * len(names):
         raise RolloutBufferError(f"scores of {scores.num_clips} clips for a buffer of {count}; judge this buffer")
-    values = torch.from_numpy(convert.from_field(scores.values, np.float64).reshape(len(names), count).copy())
-    total = torch.from_numpy(convert.from_field(scores.total, np.float64).copy())
-    valid = torch.from_numpy(convert.from_field(scores.valid, np.uint8).copy()).bool()
-    return attach_rewards(buffer, dict(zip(names, values, strict=True)), torch.where(valid, total, torch.nan))
+    values = torch.from_numpy(np.array(scores.values, np.float64).reshape(len(names), count))
+    total, valid = (torch.from_numpy(np.array(field, np.float64)) for field in (scores.total, scores.valid))
+    return attach_rewards(buffer, dict(zip(names, values, strict=True)), torch.where(valid > 0, total, torch.nan))
 
 
 def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> VideoRun:

@@ -21,10 +21,9 @@ from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.spin import run_node
-from wm_nodes.ros.wire import WireError
 from wm_nodes.ros.worker import Work
 from wm_nodes.training.run_folder import VersionFiles
-from wm_nodes.training.weights import WeightsError, load_weights
+from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.sampling import ClipGenerator
@@ -77,35 +76,29 @@ class VideoModelNode(ManagedNode):
 
     # Sampling, in a worker thread.
 
-    def _generate(self, work: Work) -> GenerateClips.Result:
+    def _generate(self, work: Work, result: GenerateClips.Result) -> None:
         goal: GenerateClips.Goal = work.request
-        result = GenerateClips.Result(termination_reason=GenerateClips.Result.FINISHED)
-        try:
-            self._follow(work, int(goal.policy_version))
-            began = time.perf_counter()
-            request = self._generator.request(int(goal.iteration), int(goal.policy_version))
+        self._follow(work, int(goal.policy_version))
+        began = time.perf_counter()
+        request = self._generator.request(int(goal.iteration), int(goal.policy_version))
 
-            def report(done: int, total: int) -> None:
-                work.check()
-                work.feedback(GenerateClips.Feedback(clips_done=done, progress=done / total))
+        def report(done: int, total: int) -> None:
+            work.check()
+            work.feedback(GenerateClips.Feedback(clips_done=done, progress=done / total))
 
-            buffer = self._generator.sample(request, on_progress=report)
-            data = buffer.to_bytes()
-            result.buffer_uri = BUFFER_FILES.uri(goal.iteration)
-            result.sha256, result.num_clips = hashlib.sha256(data).hexdigest(), len(buffer)
-            write_atomic(self.run_dir / result.buffer_uri, data)
-            self._forget_old()
-            message = ClipBatch(
-                iteration=goal.iteration, policy_version=goal.policy_version, contexts=list(request.contexts),
-                group_size=request.group_size, num_frames=buffer.rollout.latents.shape[2], buffer_uri=result.buffer_uri,
-                sha256=result.sha256, sample_s=time.perf_counter() - began, noise_share=buffer.rollout.spent_noise,
-            )
-            self._publish(message, film_strip(self._generator.folder.codec.decode(buffer.rollout.latents)))
-            self.diagnostics.latency("sample", message.sample_s)
-        except (WireError, WeightsError, ValueError, OSError) as error:
-            result.termination_reason, result.message = GenerateClips.Result.FAILED, str(error)
-            self.say_failed_goal(f"clips of iteration {goal.iteration} failed: {error}")
-        return result
+        buffer = self._generator.sample(request, on_progress=report)
+        data = buffer.to_bytes()
+        result.buffer_uri = BUFFER_FILES.uri(goal.iteration)
+        result.sha256, result.num_clips = hashlib.sha256(data).hexdigest(), len(buffer)
+        write_atomic(self.run_dir / result.buffer_uri, data)
+        self._forget_old()
+        message = ClipBatch(
+            iteration=goal.iteration, policy_version=goal.policy_version, contexts=list(request.contexts),
+            group_size=request.group_size, num_frames=buffer.rollout.latents.shape[2], buffer_uri=result.buffer_uri,
+            sha256=result.sha256, sample_s=time.perf_counter() - began, noise_share=buffer.rollout.spent_noise,
+        )
+        self._publish(message, film_strip(self._generator.folder.codec.decode(buffer.rollout.latents)))
+        self.diagnostics.latency("sample", message.sample_s)
 
     def _follow(self, work: Work, version: int) -> None:
         """Have the weights of `version`, which need not be the newest: a learner that prefetches has gone on meanwhile.

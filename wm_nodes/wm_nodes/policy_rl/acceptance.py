@@ -4,10 +4,11 @@ from pathlib import Path
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.environments.record import acceptance_plan, collect_plan, keep_plan
+from wm_nodes.environments.registry import is_simulated
 from wm_nodes.policy_rl.exploit_meter import IMAGINED_ENVS, imagine_and_replay
-from wm_nodes.policy_rl.factories import make_imagined_environment, make_video_environment, models_of
+from wm_nodes.policy_rl.factories import STARTS, make_imagined_environment, make_video_environment, models_of
 from wm_nodes.policy_rl.image_policy import ImagePolicy
-from wm_nodes.policy_rl.initial_policy import STARTS, write_starts
+from wm_nodes.policy_rl.initial_policy import write_starts
 from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.starts import load_start_seeds
@@ -17,22 +18,27 @@ from wm_nodes.world_model.validation.acceptance import (
     accept_video_model,
     accept_world_model,
     accepted_when_made,
+    report_when_made,
 )
 
 
 def accept_model(
-    config: RunConfig, model_dir: Path, policy: ImagePolicy, imagined: tuple[int, int], real: tuple[int, int],
-    folder: Path, *, video_model_dir: Path | None = None,
+    config: RunConfig, model_dir: Path, policy: ImagePolicy, imagined: tuple[int, int],
+    real: tuple[int, int] | None, folder: Path, *, video_model_dir: Path | None = None,
 ) -> AcceptanceReport:
-    """Measure whether a policy may be trained in the world model, or in the video model where one is given.
+    """Measure whether a policy may be trained in the world model, or in the video model where one is given; without a
+    simulator of the task, by what was measured when the world model was made.
 
     Args:
-        policy: that training begins with. imagined, real: its (successes, episodes) in the model and the simulator.
+        policy: that training begins with. imagined, real: its (successes, episodes) in the model and in
+            evaluation.environment; None: not measured.
         folder: of the held-out episodes; those of the same settings that are there are kept.
 
     Raises:
         ValueError: the folder was begun with other settings, and as accept_world_model.
     """
+    if real is None or not is_simulated(config):
+        return report_when_made(read_world_manifest(model_dir), config, imagined, real)
     plan = acceptance_plan(config)
     folder.mkdir(parents=True, exist_ok=True)
     keep_plan(plan, folder)
@@ -44,8 +50,10 @@ def accept_model(
     return accept_world_model(models, load_arrays(bags, config), config, imagined, real, clone)
 
 
-def acceptance_when_made(model_dir: Path, config: RunConfig) -> str:
+def acceptance_when_made(model_dir: Path | None, config: RunConfig) -> str:
     """Say in a line what acceptance makes of a world model's manifest, where there is no simulator to measure in."""
+    if model_dir is None:
+        return "there is none"
     return accepted_when_made(read_world_manifest(model_dir), config)
 
 

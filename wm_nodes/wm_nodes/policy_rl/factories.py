@@ -1,4 +1,5 @@
-"""Builds what needs more than one sibling package: policies, rewards and environments from a model folder."""
+"""Builds what needs more than one sibling package: policies, rewards, learners and environments, from a model folder or
+by the factory that the settings name."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -10,17 +11,24 @@ from typing import TypeVar
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.tasks import is_simulated
 from wm_nodes.core.cameras import CameraModel
 from wm_nodes.core.device import CPU, compute_device, explain_memory
+from wm_nodes.core.factory import load_factory
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import MODEL_FIELDS, EnvironmentSpec, agree, tool_spec
-from wm_nodes.core.types import FloatArray, Observation, UInt8Array
-from wm_nodes.environments.maniskill.cameras import hand_over, table_top_cameras
-from wm_nodes.environments.registry import configured_spec
-from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
-from wm_nodes.reward import EncoderDistance, EndogenousReward
+from wm_nodes.core.types import Environment, FloatArray, Observation, UInt8Array
+from wm_nodes.environments.cameras import simulated_cameras
+from wm_nodes.environments.registry import configured_spec, make_environment
+from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy, commanded_range
+from wm_nodes.policy_rl.learner import Learner
+from wm_nodes.policy_rl.ppo import PpoLearner
+from wm_nodes.reward import EncoderDistance, EndogenousReward, RewardModel, RuleReward
+from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import load_weights_file
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_model.success_reader import SuccessReader, load_success_reader
@@ -36,6 +44,12 @@ from wm_nodes.world_model import (
 )
 from wm_nodes.world_model.folder import model_spec, read_world_manifest
 from wm_nodes.world_model.precision import compute_context
+
+STARTS = "starts.safetensors"
+"""First frames to imagine from, in a model's folder and in a run's."""
+UNTRAINED = "wm_nodes.policy_rl.factories:untrained_policy"
+GRID = 4
+"""Rows and columns of the mean colours that untrained_policy sees."""
 
 _Imagined = TypeVar("_Imagined", ImaginedEnvironment, DeviceEnvironment)
 
@@ -61,22 +75,74 @@ def make_encoder(model_dir: Path, device: str = CPU, *, positions: bool = False)
     )
 
 
+def chosen_model(config: RunConfig, folder: str = "") -> Path | None:
+    """The world model of a folder, else the shipped one of the task; without a task none: the real environment is
+    trained in."""
+    return Path(folder) if folder else shipped_model(config.task) if config.task else None
+
+
 def run_spec(config: RunConfig, model_dir: Path) -> EnvironmentSpec:
-    """The environment of a run: of the configured task in its simulator, or without a task the one that the world model
-    was trained with. Raises ModelFolderError: the folder says none."""
-    return configured_spec(config) if config.task else model_spec(model_dir, read_world_manifest(model_dir))
+    """The environment of a run: of the configured task in its simulator, or where it has none the one that the world
+    model was trained with. Raises ModelFolderError: the folder says none."""
+    if is_simulated(config.task):
+        return configured_spec(config)
+    return model_spec(model_dir, read_world_manifest(model_dir))
 
 
-def make_policy(config: RunConfig, model_dir: Path) -> ImagePolicy:
-    """Return a policy with fresh weights for run_spec. Measured states are shifted and scaled by what was recorded."""
+def make_policy(config: RunConfig, model_dir: Path | None) -> ImagePolicy:
+    """Return a policy with fresh weights: that of policy.factory, else one for run_spec, whose measured states are
+    shifted and scaled by what was recorded.
+
+    Raises:
+        ValueError: neither a factory nor a model.
+    """
+    if config.policy.factory:
+        own: ImagePolicy = load_factory(config.policy.factory)(config)
+        return own.to(compute_device(config.device))
+    if model_dir is None:
+        raise ValueError(f"a policy sees by a world model's tokenizer; name a model's folder, or policy.factory, e.g. "
+                         f"{UNTRAINED}")
     encoder = make_encoder(model_dir, config.device, positions=config.policy.positions)
     spec = run_spec(config, model_dir)
-    recorded = models_of(Path(model_dir), config.device).action.condition if spec.measured else None
+    state_range = commanded_range(spec, config.policy)
+    if spec.measured:
+        recorded = models_of(Path(model_dir), config.device).action.condition
+        state_range = recorded.state_mean.tolist(), recorded.state_scale.tolist()
     policy = ImagePolicy(
-        encoder, spec.state_dim, spec.action_dim, config.policy, seed=config.seed,
-        state_range=None if recorded is None else (recorded.state_mean.tolist(), recorded.state_scale.tolist()),
+        encoder, spec.state_dim, spec.action_dim, config.policy, seed=config.seed, state_range=state_range
     )
     return policy.to(compute_device(config.device))
+
+
+def untrained_policy(config: RunConfig) -> ImagePolicy:
+    """Return a policy for configured_spec that sees GRID x GRID mean colours and, before training, acts at random: for
+    the first recordings, before there is a model whose tokenizer a policy could see by. A value of policy.factory."""
+    spec = configured_spec(config)
+
+    def encode(images: Tensor) -> Tensor:
+        return adaptive_avg_pool2d(images.movedim(-1, 1).float() / 255, GRID).flatten(1)
+
+    encoder = ImageEncoder(encode, 3 * GRID * GRID)
+    unscaled = [0.0] * spec.state_dim, [1.0] * spec.state_dim
+    return ImagePolicy(encoder, spec.state_dim, spec.action_dim, config.policy, seed=config.seed, state_range=unscaled)
+
+
+def make_reward(config: RunConfig, model_dir: Path | None) -> RewardModel:
+    """Return what a step is worth: the reward of reward.factory, else the endogenous one of the world model, or without
+    a model the environment's own success. Raises as make_endogenous_reward."""
+    if config.reward.factory:
+        own: RewardModel = load_factory(config.reward.factory)(config)
+        return own
+    return RuleReward(config.reward.sparse_weight) if model_dir is None else make_endogenous_reward(config, model_dir)
+
+
+def make_learner(policy: ImagePolicy, config: RunConfig, ranks: Ranks | None = None) -> Learner:
+    """Return the algorithm that trains `policy` in place: that of learner.factory, else PPO, to which the present
+    weights are the reference that the policy stays close to."""
+    if config.learner.factory:
+        own: Learner = load_factory(config.learner.factory)(policy, config)
+        return own
+    return PpoLearner(policy, config.ppo, seed=config.seed, ranks=ranks)
 
 
 def load_policy(config: RunConfig, model_dir: Path, weights: Path) -> ImagePolicy:
@@ -179,9 +245,9 @@ def make_device_environment(
 
 
 def _cameras(config: RunConfig, environment: ImaginedEpisodes) -> Sequence[CameraModel]:
-    if not config.task:
+    if not is_simulated(config.task):
         return ()
-    return table_top_cameras(config.simulation, lambda env: hand_over(environment.current().state[env]))
+    return simulated_cameras(config.simulation, lambda env: environment.current().state[env])
 
 
 def _imagine(
@@ -198,12 +264,16 @@ def _imagine(
 
 
 def make_training_environment(
-    config: RunConfig, model_dir: Path, starts_file: Path, *, num_envs: int, seed: int
-) -> ImaginedEnvironment | DeviceEnvironment:
+    config: RunConfig, model_dir: Path | None, *, num_envs: int, seed: int
+) -> Environment | DeviceEnvironment:
     """Return the environment that policy_rl.train trains in fastest: on a GPU rollouts stay there, unless
-    imagined_environment is set."""
+    imagined_environment or a factory is set. Without a model it is the real one."""
     settings = config.imagined_environment
-    if compute_device(config.device).type == CPU or settings.picture_noise or settings.second_model:
+    if model_dir is None:
+        return make_environment(config, config.environment.factory, num_envs=num_envs, seed=seed)
+    starts_file = model_dir / STARTS
+    factory = config.policy.factory or config.reward.factory or config.learner.factory
+    if compute_device(config.device).type == CPU or settings.picture_noise or settings.second_model or factory:
         return make_imagined_environment(config, model_dir, starts_file, num_envs=num_envs, seed=seed, training=True)
     return make_device_environment(config, model_dir, starts_file, num_envs=num_envs)
 

@@ -15,14 +15,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from wm_nodes.config.schema import PolicyConfig
-from wm_nodes.core.action_spaces import SPACES
 from wm_nodes.core.seeding import stream_seed
+from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.policy_rl.gaussian import DiagonalGaussian
-
-TOOL_CENTER_M = (0.6, 0.0, 0.15)
-TOOL_SCALE_M, TURN_SCALE_RAD = 0.2, 0.5
-"""The commanded tool position in the robot base frame lies within about one scale of the centre, m."""
 
 _FEATURE_LIMIT = 5.0
 _RELATIVE_STD_FLOOR = 0.1
@@ -61,18 +57,27 @@ class PolicyOutput:
     values: FloatArray
 
 
+def commanded_range(spec: EnvironmentSpec, config: PolicyConfig) -> tuple[Sequence[float], Sequence[float]]:
+    """Shift and scale (S,) of a commanded state, by the units of its values and the axes in their names."""
+    centers = dict(zip(("_x", "_y", "_z"), config.position_center_m, strict=True))
+    scales = {"m": config.position_scale_m, "rad": config.rotation_scale_rad}
+    units = list(zip(spec.state_names, spec.state_units, strict=True))
+    return (
+        [centers.get(name[-2:], 0.0) if unit == "m" else 0.0 for name, unit in units],
+        [scales.get(unit, 1.0) for _, unit in units],
+    )
+
+
 class ImagePolicy(nn.Module):
     """Separate actor and critic networks on encoder features and robot state.
 
     Args:
         encoder: frozen; see ImageEncoder.
-        state_dim: S. Of the size of one of core.action_spaces.SPACES, the state is of that one: positions are shifted
-            by TOOL_CENTER_M and scaled by TOOL_SCALE_M, rotations by TURN_SCALE_RAD. What a larger state has after a
-            pose says which task it is, and is taken as it is.
-        state_range: shift and scale of each value of the state (S,), instead.
+        state_dim: S.
         action_dim: A.
         config: sizes and the initial log standard deviation.
         seed: of the initial weights (stream `policy_init`).
+        state_range: shift and scale of each value of the state (S,); None: it is taken as it is.
     """
 
     def __init__(
@@ -82,13 +87,7 @@ class ImagePolicy(nn.Module):
         super().__init__()
         self.encoder = encoder
         self.state_dim, self.action_dim, self.config = state_dim, action_dim, config
-        sizes = {len(space.units): space.units for space in SPACES.values()}
-        known = sizes.get(min(state_dim, max(sizes)), ())
-        units = known + ("1",) * (state_dim - len(known))
-        center: Sequence[float] = [TOOL_CENTER_M[i] if unit == "m" else 0.0 for i, unit in enumerate(units)]
-        scale: Sequence[float] = [{"m": TOOL_SCALE_M, "rad": TURN_SCALE_RAD, "1": 1.0}[unit] for unit in units]
-        if state_range is not None:
-            center, scale = state_range
+        center, scale = state_range or ((0.0,) * state_dim, (1.0,) * state_dim)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(stream_seed(seed, "policy_init"))
             self.actor = _Network(encoder, state_dim, action_dim, config, output_gain=0.01)

@@ -13,21 +13,21 @@ from safetensors.torch import save
 
 from wm_nodes.config import seed_ranges
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.config.tasks import get_task, success
+from wm_nodes.config.tasks import get_task, has_rule, success
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Episode
-from wm_nodes.environments.maniskill.collection import CollectionPlan
+from wm_nodes.environments.collection import CollectionPlan
 from wm_nodes.environments.record import collect_plan, demonstration_plan, first_frames_plan, scripted_plan
-from wm_nodes.policy_rl.behaviour_cloning import demonstrations, train_sft
-from wm_nodes.policy_rl.factories import make_policy, make_reconstruct
+from wm_nodes.policy_rl.behaviour_cloning import EXPERT, demonstrations, train_sft
+from wm_nodes.policy_rl.factories import STARTS, make_policy, make_reconstruct, run_spec
 from wm_nodes.policy_rl.image_policy import ImagePolicy
-from wm_nodes.recording import read_episodes
+from wm_nodes.recording import BagReport, read_episodes
 from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.starts import INSTRUCTIONS, join_starts, pack_instructions
 
-STARTS, MADE_OF = "starts.safetensors", "starts.json"
+MADE_OF = "starts.json"
 MAX_STARTS, MODEL_STARTS = 512, 64
 """Most first frames of a run, and of those beside a model, from which a launch file imagines by default; of a model of
 several scenes, half as many of each task."""
@@ -91,19 +91,28 @@ def write_round_starts(config: RunConfig, first_frames: Path, bags: Iterable[Pat
 
 def frames_before_success(episode: Episode, tasks: Sequence[str] = ()) -> int:
     """Return how many frames an episode has before it succeeds in any of the tasks or its own; at least 1."""
-    others = [success(task, episode.ground_truth) for task in tasks if task != episode.task]
+    others = [success(task, episode.ground_truth) for task in tasks if task != episode.task and has_rule(task)]
     done = np.logical_or.reduce([episode.success, *others])
     return max(1, int(done.argmax())) if done.any() else len(done)
 
 
-def train_weak_policy(config: RunConfig, model_dir: Path, demo_bags: Iterable[Path], path: Path) -> ImagePolicy:
+def train_weak_policy(
+    config: RunConfig, model_dir: Path, demo_bags: Iterable[Path], path: Path, *, anyone: bool = False
+) -> ImagePolicy:
     """Behaviour-clone a few demonstrations on raw and on tokenizer-reconstructed frames; write the weights to `path`.
 
+    anyone: whoever acted in a successful episode has demonstrated, not the planner alone.
+
     Raises:
-        ValueError: the bags hold fewer successful demonstrations than sft.num_demonstrations.
+        ValueError: the bags hold fewer successful demonstrations than sft.num_demonstrations. BagError: they are of
+            another robot or other cameras than the model.
     """
-    policy = make_policy(config, model_dir)
-    demos = demonstrations((e for bag in demo_bags for e in read_episodes(bag)), config.sft.num_demonstrations)
+    policy, spec = make_policy(config, model_dir), run_spec(config, model_dir)
+    report = BagReport() if anyone else None  # of what a live recording lost
+    episodes = (e for bag in demo_bags for e in read_episodes(bag, expected=spec, report=report))
+    if anyone:
+        episodes = (replace(episode, behaviour=EXPERT) for episode in episodes)
+    demos = demonstrations(episodes, config.sft.num_demonstrations)
     train_sft(policy, demos, config.sft, config.seed, reconstruct=make_reconstruct(model_dir, config.device))
     save_weights(policy, path, {"tokenizer_sha256": policy.encoder.sha256})
     return policy
@@ -137,19 +146,24 @@ def _keep_settings(config: RunConfig, run_dir: Path, model_dir: Path) -> None:
 
 
 def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Path, Path]:
-    """Collect demonstrations and starts and train the weak policy, as far as missing; return start_files().
+    """Collect demonstrations and starts and train the weak policy, as far as missing; return start_files(). Where
+    sft.bags names the demonstrations, or no task can be simulated, those and the model's starts are taken.
 
     Raises:
         ValueError: the folder holds those of other settings or of another tokenizer.
     """
     _keep_settings(config, run_dir, model_dir)
-    spare = max(3, config.sft.num_demonstrations // 3)
-    plan = demonstration_plan(config, config.sft.num_demonstrations + spare)
-    demos = collect_plan(plan, config, run_dir / "bags" / "demos")
+    demos = [Path(bag) for bag in config.sft.bags]
+    if not demos:
+        spare = max(3, config.sft.num_demonstrations // 3)
+        plan = demonstration_plan(config, config.sft.num_demonstrations + spare)
+        demos = collect_plan(plan, config, run_dir / "bags" / "demos")
     starts, weak = start_files(run_dir)
-    if not starts.exists():
+    if not starts.exists() and not config.task:
+        write_atomic(starts, (model_dir / STARTS).read_bytes())
+    elif not starts.exists():
         bags = collect_plan(starts_plan(config), config, run_dir / "bags" / "starts")
         write_starts(bags, starts, frames=config.data.start_frames, seed=config.seed)
     if not weak.exists():
-        train_weak_policy(config, model_dir, demos, weak)
+        train_weak_policy(config, model_dir, demos, weak, anyone=bool(config.sft.bags))
     return starts, weak

@@ -13,19 +13,20 @@ from typing import Any
 
 from wm_nodes.config.schema import RunConfig, TokenizerConfig, WorldModelConfig
 from wm_nodes.config.seed_ranges import HELDOUT_ROUNDS, MODEL_EPISODES, ROUNDS, seed_spans
-from wm_nodes.config.tasks import get_task, recorded_task
+from wm_nodes.config.tasks import recorded_task
 from wm_nodes.core.device import compute_device, explain_memory
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.statistics import bootstrap_mean, paired_difference
-from wm_nodes.environments.maniskill.collection import CollectionPlan
+from wm_nodes.environments.collection import CollectionPlan
 from wm_nodes.environments.record import collect_plan, scripted_plan
-from wm_nodes.policy_rl.factories import policy_actor
-from wm_nodes.policy_rl.initial_policy import STARTS, write_round_starts
+from wm_nodes.policy_rl.factories import STARTS, policy_actor
+from wm_nodes.policy_rl.initial_policy import write_round_starts
 from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.recording import read_episodes
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model import ActionModel, WorldModels, load_model_folder, save_refreshed_folder
 from wm_nodes.world_model.folder import read_world_manifest
+from wm_nodes.world_model.positions import judged_things
 from wm_nodes.world_model.training.dynamics import train_action_model
 from wm_nodes.world_model.validation.open_loop import episode_errors
 
@@ -176,7 +177,7 @@ def compare_models(old: WorldModels, new: WorldModels, heldout: EpisodeArrays, c
         for models in (old, new)
     )
     rows = []
-    for name in ("tool", "object") if get_task(config.task).moves_object else ("tool",):
+    for name in judged_things(config.task):
         old_cm, new_cm = before[f"{name}_cm"], after[f"{name}_cm"]
         _, low, high = bootstrap_mean(new_cm - old_cm, seed=config.seed)
         rows.append(ModelComparison(f"{name} error, cm", float(old_cm.mean()), float(new_cm.mean()), low, high, True))

@@ -20,11 +20,10 @@ from wm_nodes.core.device import compute_device, device_label, explain_memory
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.seeding import initial_weights
 from wm_nodes.core.specs import EnvironmentSpec, tool_spec
-from wm_nodes.environments.maniskill.collection import POLICY_LABEL, CollectionPlan
-from wm_nodes.environments.maniskill.episodes import EXTREME
+from wm_nodes.environments.collection import EXTREME, POLICY_LABEL, CollectionPlan
 from wm_nodes.environments.record import collect_plan, collect_scripted, demonstration_plan
-from wm_nodes.policy_rl.factories import policy_actor
-from wm_nodes.policy_rl.initial_policy import MODEL_STARTS, STARTS, train_weak_policy, write_starts
+from wm_nodes.policy_rl.factories import STARTS, policy_actor
+from wm_nodes.policy_rl.initial_policy import MODEL_STARTS, train_weak_policy, write_starts
 from wm_nodes.recording import BagReport, read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.reports.summary import plain
@@ -213,7 +212,7 @@ def _collect_policy_bags(
     They need the tokenizer only, so they are collected before the action model is trained and belong to its data.
     """
     bags = list[Path]()
-    weak = [(policy, task) for task in model_tasks(config.task) for policy in get_task(task).weak_policies]
+    weak = [(policy, task) for task in model_tasks(config.task) for policy in get_task(task).model.weak_policies]
     for policy, task in sorted(weak, key=lambda pair: pair[0].number):
         number, sft = policy.number, config.sft.model_copy(update={"num_demonstrations": policy.demonstrations})
         chosen = config.model_copy(update={"task": task, "sft": sft})

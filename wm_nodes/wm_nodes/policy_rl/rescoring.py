@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.lockstep import Rewards
 from wm_nodes.policy_rl.factories import make_endogenous_reward
 from wm_nodes.policy_rl.rollouts import reward_input
 from wm_nodes.recording import Bag, BagError
-from wm_nodes.recording.lockstep import LockSteps, RecordedReward
+from wm_nodes.recording.join import LockSteps
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reward import RewardModel, RewardResult, RuleReward
 
@@ -46,12 +47,12 @@ def rescore_bag(path: Path, model: RewardModel, *, namespace: str | None = None)
     report = RescoreReport()
     with Bag(path) as bag:
         for step in LockSteps(bag, namespace=namespace, reward_name=model.name):
-            if step.reward is None:
+            if step.rewards is None:
                 report.unrewarded += int(step.valid.any())
                 continue
-            if step.reward.reward_version != model.version:
+            if step.rewards.version != model.version:
                 raise BagError(
-                    f"{path} holds {model.name} rewards of version {step.reward.reward_version}, this model is "
+                    f"{path} holds {model.name} rewards of version {step.rewards.version}, this model is "
                     f"{model.version}; build it with the weights and thresholds of the run's configuration"
                 )
             if step.images is None or step.next_images is None:
@@ -59,7 +60,7 @@ def rescore_bag(path: Path, model: RewardModel, *, namespace: str | None = None)
                 continue
             report.compared += 1
             given = reward_input(step.images, step.next_images, step, step.goals)
-            wrong = _differences(step.reward, model.evaluate(given))
+            wrong = _differences(step.rewards, model.evaluate(given))
             if wrong:
                 report.different.append(f"step_id {step.step_id}: {', '.join(wrong)}")
     if not report.compared:
@@ -91,7 +92,7 @@ def recorded_model(
     return make_endogenous_reward(config, model_dir or (own if own.is_dir() else shipped_model(config.task)))
 
 
-def _differences(recorded: RecordedReward, result: RewardResult) -> list[str]:
+def _differences(recorded: Rewards, result: RewardResult) -> list[str]:
     pairs = {name: (getattr(recorded, name), getattr(result, name)) for name in ("total", "dense", "sparse", "success")}
     pairs["valid"] = recorded.valid, result.valid
     for column, name in enumerate(recorded.component_names):

@@ -8,7 +8,7 @@ Shapes: T time, N environments, F features, S state, A action, H W 3 image.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from wm_nodes.config.seed_ranges import EVALUATION
+from wm_nodes.core.lockstep import LockStep
 from wm_nodes.core.seeding import numpy_stream, torch_stream
-from wm_nodes.core.types import BoolArray, Environment, FloatArray, Rollout, UInt8Array, UInt64Array
+from wm_nodes.core.types import BoolArray, Environment, FloatArray, Rollout, StepResult, UInt8Array, UInt64Array
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.reward import RewardInput, RewardModel
 
@@ -222,19 +223,8 @@ def collect_rollout(
     return Rollout(policy_version=policy_version, **{name: np.stack(rows) for name, rows in columns.items()})
 
 
-class StepOutcome(Protocol):
-    """What StepResult and recording.lockstep.RecordedStep say of a lock-step; see StepResult."""
-
-    @property
-    def success_probability(self) -> FloatArray: ...
-    @property
-    def valid(self) -> BoolArray: ...
-    @property
-    def uncertainty(self) -> FloatArray: ...
-
-
 def reward_input(
-    images: UInt8Array, next_images: UInt8Array, step: StepOutcome, goals: tuple[UInt8Array, BoolArray] | None
+    images: UInt8Array, next_images: UInt8Array, step: StepResult | LockStep, goals: tuple[UInt8Array, BoolArray] | None
 ) -> RewardInput:
     """Return what a reward model needs of one lock-step. goals: env.goals() as of before the step."""
     frames, known = goals if goals is not None else (None, None)

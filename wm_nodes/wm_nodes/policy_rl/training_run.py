@@ -19,6 +19,7 @@ import numpy as np
 import torch.distributed
 
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.lockstep import DroppedTransitions
 from wm_nodes.core.model_folder import read_json
 from wm_nodes.core.named_files import CHECKPOINT, read_regular
 from wm_nodes.core.types import Rollout
@@ -33,13 +34,6 @@ from wm_nodes.training.weights import PackedWeights, load_weights, pack_weights
 POLICY_FILES = VersionFiles("policies/policy")
 
 
-@dataclass(frozen=True)
-class DroppedTransitions:
-    """Transitions (single environments' steps) left out of a rollout, by reason."""
-
-    invalid: int = 0
-    gap: int = 0
-    stale: int = 0
 
 
 @dataclass

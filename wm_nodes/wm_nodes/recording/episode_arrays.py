@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.config.tasks import parts_of, shares_scene, success, task_names
+from wm_nodes.config.tasks import has_rule, parts_of, shares_scene, success
 from wm_nodes.core.types import BoolArray, Episode, FloatArray, UInt8Array
 
 TaskLabels = Callable[[str, FloatArray], BoolArray]
@@ -16,25 +16,31 @@ TaskLabels = Callable[[str, FloatArray], BoolArray]
 
 @dataclass(frozen=True)
 class EpisodeArrays:
-    """E episodes padded to T steps by repeating their last frame; only the first `lengths` steps are real.
-
-    images: uint8 (E, T + 1, H, W, 3). states: float32 (E, T + 1, S), of the tool. actions: float32 (E, T, A), 0 where
-    padded. ground_truth: float32 (E, T + 1, P). success: bool (E, T + 1, J), column j for tasks[j], see `labelled`.
-    lengths: int64 (E,). recorded_tasks: the task that each episode was recorded for, with its instruction; where the
-    state says which task it is (Task.parts), that one. seeds: of their resets; () where unknown.
-    """
+    """E episodes padded to T steps by repeating their last frame; only the first `lengths` steps are real."""
 
     images: UInt8Array
+    """(E, T + 1, H, W, 3)."""
     states: FloatArray
+    """(E, T + 1, S), of the tool."""
     actions: FloatArray
+    """(E, T, A), 0 where padded."""
     ground_truth: FloatArray
+    """(E, T + 1, P)."""
     success: BoolArray
+    """(E, T + 1, J), column j for tasks[j], see `labelled`."""
     lengths: NDArray[np.int64]
+    """(E,), real steps."""
     tasks: tuple[str, ...]
+    """The J tasks that success is about."""
     instructions: tuple[str, ...]
+    """(E,)."""
     behaviours: tuple[str, ...]
+    """(E,), who acted."""
     recorded_tasks: tuple[str, ...]
+    """(E,), the task that each was recorded for, with its instruction; where the state says which task it is
+    (Task.parts), that one."""
     seeds: tuple[int, ...] = ()
+    """(E,), of their resets; () where unknown."""
 
     def __len__(self) -> int:
         return len(self.images)
@@ -101,7 +107,7 @@ def stack_episodes(
 ) -> EpisodeArrays:
     """Stack episodes of one camera set-up; longer ones are cut to num_steps (None: the longest decides).
 
-    A task without a file is done where its recorded episodes say so; `labels` are those of the other tasks.
+    A task without a rule in its file is done where its recorded episodes say so; `labels` are those of the other tasks.
 
     Raises:
         ValueError: no episodes, episodes of different image, state or action sizes, or as check_finite.
@@ -124,7 +130,7 @@ def stack_episodes(
         actions[row, : lengths[row]] = episode.actions[: lengths[row]]
     truth = np.stack([e.ground_truth[rows] for e, rows in zip(listed, frame_rows, strict=True)])
     said = np.stack([e.success[rows] for e, rows in zip(listed, frame_rows, strict=True)])
-    with_rule = set(tasks) if labels is not success else set(tasks) & set(task_names())
+    with_rule = set(tasks) if labels is not success else {*filter(has_rule, tasks)}
     return EpisodeArrays(
         images=np.stack([e.images[rows] for e, rows in zip(listed, frame_rows, strict=True)]),
         states=np.stack([s[rows] for s, rows in zip(tool_states, frame_rows, strict=True)]), actions=actions,

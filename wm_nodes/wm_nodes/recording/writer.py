@@ -23,8 +23,9 @@ from typing import Any
 
 import numpy as np
 
+from wm_nodes.core.lockstep import LockStep
 from wm_nodes.core.specs import EnvironmentSpec
-from wm_nodes.core.types import Episode
+from wm_nodes.core.types import Episode, FloatArray
 from wm_nodes.recording import messages as m
 from wm_nodes.recording import topics
 from wm_nodes.recording.raw import RawBagWriter
@@ -142,24 +143,24 @@ class EpisodeBagWriter:
         """Transition of action `step`; step -1 is the reset that shows frame 0."""
         is_reset, is_last = step < 0, step == episode.num_steps - 1
         frame = step + 1
-        truth = episode.ground_truth[frame]
+        truth, action, state = episode.ground_truth[frame], episode.actions[max(step, 0)], episode.states[max(step, 0)]
         unknown = np.full(1, np.nan, np.float32)
-        return m.message_type(topics.TRANSITION.msgtype)(
-            header=m.header(now_ns, m.BASE_FRAME), session=self._session, seq=self._seq(topics.TRANSITION),
-            next_stamp=m.stamp(next_ns), step_id=self._next_step_id - 1 if is_reset else self._next_step_id, num_envs=1,
-            action=np.zeros(self.spec.action_dim, np.float32) if is_reset else m.floats(episode.actions[step]),
-            state=m.floats(episode.states[max(step, 0)]), next_state=m.floats(episode.states[frame]), log_prob=unknown,
-            value=unknown, terminated=_flag(is_last and episode.terminated),
-            truncated=_flag(is_last and episode.truncated), valid=_flag(not is_reset),
-            episode_id=np.array([episode.episode_id], np.uint64), episode_step=np.array([max(step, 0)], np.uint32),
-            policy_version=np.array([episode.policy_version], np.uint64),
+        lockstep = LockStep(
+            session=self._session, step_id=self._next_step_id - is_reset, stamp_ns=now_ns, next_stamp_ns=next_ns,
+            actions=_floats(np.zeros_like(action) if is_reset else action)[None], states=_floats(state)[None],
+            next_states=_floats(episode.states[frame])[None], logprobs=unknown, values=unknown,
+            terminated=np.array([is_last and episode.terminated], bool),
+            truncated=np.array([is_last and episode.truncated], bool), valid=np.array([not is_reset]),
+            episode_ids=np.array([episode.episode_id], np.uint64), episode_steps=np.array([max(step, 0)], np.uint32),
+            policy_versions=np.array([episode.policy_version], np.uint64),
             success_probability=np.array([episode.success[frame]], np.float32),
-            model_uncertainty=np.zeros(1, np.float32), ground_truth=m.floats([] if np.isnan(truth).all() else truth),
+            uncertainty=np.zeros(1, np.float32), ground_truth=_floats([] if np.isnan(truth).all() else truth)[None],
             source=episode.source,
         )
+        return m.lockstep_message(lockstep, self._seq(topics.TRANSITION))
 
     def _reward(self, episode: Episode, step: int, now_ns: int) -> Any:
-        reward = m.floats(episode.rewards[step])
+        reward = _floats(episode.rewards[step])
         return m.message_type(topics.REWARD.msgtype)(
             header=m.header(now_ns, m.BASE_FRAME), session=self._session, seq=self._seq(topics.REWARD),
             transition_session=self._session, step_id=self._next_step_id, num_envs=1, total=reward,
@@ -214,6 +215,10 @@ class EpisodeBagWriter:
             raise ValueError(f"{name}: actions must be finite and in [-1, 1]; store them as executed, after clipping")
         if episode.episode_id in self._seen:
             raise ValueError(f"{name} was written before; episode_id must be unique within a bag")
+
+
+def _floats(values: Any) -> FloatArray:
+    return np.asarray(values, np.float32).reshape(-1)
 
 
 def _flag(value: Any) -> Any:

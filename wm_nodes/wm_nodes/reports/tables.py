@@ -13,17 +13,25 @@ from wm_nodes.reports.summary import SuccessRate, Summary
 
 @dataclass(frozen=True)
 class Cell:
-    """One rate as texts: "123 / 200", "61.5 %", "95 %: 54.6 to 68.0 %"."""
+    """One rate as texts."""
 
     count: str
+    """E.g. "123 / 200"."""
     percent: str
+    """E.g. "61.5 %"."""
     interval: str
+    """E.g. "95 %: 54.6 to 68.0 %"."""
 
 
 class ResultRow(NamedTuple):
+    """A line of the table of results."""
+
     label: str
+    """What was measured."""
     real: Cell
+    """In the simulator."""
     imagined: Cell
+    """In the world model."""
 
 
 def result_rows(summary: Summary) -> list[ResultRow]:
@@ -41,6 +49,9 @@ def result_rows(summary: Summary) -> list[ResultRow]:
 
 def verdict(summary: Summary) -> str:
     """One sentence: whether the real difference is above what chance explains."""
+    if summary.real_after is None:
+        return ("Nothing real was measured (evaluation.environment is none): what is imagined does not say whether the "
+                "policy got better.")
     if "low" not in summary.paired:
         return "The real difference was not measured on paired seeds."
     points, low, high = (100 * float(summary.paired[name]) for name in ("difference", "low", "high"))
@@ -135,14 +146,18 @@ def _share(rate: Mapping[str, Any]) -> str:
     return f"{100 * rate['rate']:.1f} % ({rate['successes']}/{rate['episodes']})"
 
 
-def _rate(rate: SuccessRate) -> Cell:
+def _rate(rate: SuccessRate | None) -> Cell:
+    if rate is None:
+        return Cell("", "not measured", "")
     return Cell(
         f"{rate.successes} / {rate.episodes}", f"{100 * rate.rate:.1f} %",
         f"95 %: {100 * rate.low:.1f} to {100 * rate.high:.1f} %",
     )
 
 
-def _difference(before: SuccessRate, after: SuccessRate, paired: Mapping[str, Any]) -> Cell:
+def _difference(before: SuccessRate | None, after: SuccessRate | None, paired: Mapping[str, Any]) -> Cell:
+    if before is None or after is None:
+        return _rate(None)
     points = f"{100 * (after.rate - before.rate):+.1f} points"
     if "low" not in paired or not math.isfinite(float(paired["low"])):
         return Cell("", points, "not paired")

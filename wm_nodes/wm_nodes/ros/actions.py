@@ -10,20 +10,27 @@ blocking one cannot be cancelled. Here the executor only accepts, cancels and se
 import threading
 import traceback
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 
+from wm_nodes.core.errors import WireError
 from wm_nodes.ros.guard import LOG_PERIOD_S
-from wm_nodes.ros.wire import Cancelled
-from wm_nodes.ros.worker import Work, WorkerNode
+from wm_nodes.ros.wire import Cancelled, PeerLost
+from wm_nodes.ros.worker import Work
+
+if TYPE_CHECKING:
+    from wm_nodes.ros.lifecycle import ManagedNode
 
 RESULTS_KEPT_S = 120
 """How long the result of an ended goal can be asked for."""
 ABANDON_S = 3.0
 """A goal whose work has not ended so long after its node was told to end is answered all the same; the starter kills a
 node after 10 s."""
+
+REFUSALS = (WireError, ValueError, OSError, FloatingPointError)
+"""What a bad request or a bad file raises: answered in one line, without a trace."""
 
 
 class _Guarded:
@@ -69,13 +76,14 @@ class WorkerAction:
         node: a ManagedNode; goals are refused while it is not active.
         action_type: e.g. wm_msgs.action.Train.
         name: relative action name.
-        run: does the work in its own thread and returns a Result; raises Cancelled when told to stop.
-        fill: completes the Result of a goal that ended early; it has termination_reason (one of the Result's constants
-            CANCELED, DEACTIVATED, FAILED, REFUSED) and message.
+        run: does the work in its own thread and fills a Result, whose termination_reason is FINISHED at first; raises
+            Cancelled when told to stop. PeerLost ends the goal with PEER_LOST (FAILED where the Result has none), one
+            of REFUSALS with FAILED and its text; both are said and counted.
+        fill: completes the Result of every goal, also of one that ended early.
     """
 
     def __init__(
-        self, node: WorkerNode, action_type: type[Any], name: str, run: Callable[[Work], Any],
+        self, node: "ManagedNode", action_type: type[Any], name: str, run: Callable[[Work, Any], None],
         fill: Callable[[Any], Any] = lambda result: result,
     ) -> None:
         self._node, self._type, self._name, self._run, self._fill = node, action_type, name, run, fill
@@ -164,22 +172,30 @@ class WorkerAction:
 
     def _thread_main(self, goal_handle: ServerGoalHandle, work: Work) -> None:
         reasons = self._type.Result
+        result, cancelled = reasons(termination_reason=reasons.FINISHED), False
         try:
-            result, state = self._run(work), "succeed"
-            if result.termination_reason not in (reasons.FINISHED, getattr(reasons, "LIMIT", reasons.FINISHED)):
-                state = "abort"
+            self._run(work, result)
         except Cancelled as stop:
             cancelled = str(stop) == "cancelled"
             code = reasons.CANCELED if cancelled else reasons.DEACTIVATED
-            result, state = self._end_early(code, str(stop)), "canceled" if cancelled else "abort"
+            result = reasons(termination_reason=code, message=str(stop))
+        except PeerLost as error:
+            self._fail(result, f"a peer is lost: {error}", getattr(reasons, "PEER_LOST", reasons.FAILED))
+        except REFUSALS as error:
+            self._fail(result, str(error), reasons.FAILED)
         except Exception as error:
             self._node.get_logger().error(traceback.format_exc())
             text = f"{type(error).__name__}: {error}"
             if isinstance(error, MemoryError) or "allocate memory" in text:
                 text += "; a larger memory_limit_gib allows more"
-            self._node.say_failed_goal(f"{self._name} failed: {text}")
-            result, state = self._end_early(reasons.FAILED, text), "abort"
-        self._conclude(goal_handle, work, result, state)
+            self._fail(result, text, reasons.FAILED)
+        done = (reasons.FINISHED, getattr(reasons, "LIMIT", reasons.FINISHED))
+        state = "canceled" if cancelled else "succeed" if result.termination_reason in done else "abort"
+        self._conclude(goal_handle, work, self._fill(result), state)
+
+    def _fail(self, result: Any, text: str, reason: int) -> None:
+        result.termination_reason, result.message = reason, text
+        self._node.say_failed_goal(f"{self._name} failed: {text}")
 
     def _conclude(self, goal_handle: ServerGoalHandle, work: Work, result: Any, state: str) -> None:
         """Answer a goal, once."""

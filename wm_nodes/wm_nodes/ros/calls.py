@@ -1,7 +1,6 @@
 """The services env/step and env/reset: commands and replies as numpy, to requests and responses and back. Shapes: N
 environments, A action, S state, H W 3 image."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,21 +8,12 @@ from sensor_msgs.msg import Image
 
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import ResetBatch, StepBatch
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.specs import EnvironmentSpec
-from wm_nodes.core.types import UInt64Array
-from wm_nodes.ros.convert import (
-    flags,
-    floats,
-    from_field,
-    images_of,
-    mosaic_msg,
-    reshape_field,
-    set_optional,
-    time_msg,
-    time_ns,
-    to_field,
-)
-from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand, WireError
+from wm_nodes.core.types import FloatArray, UInt64Array
+from wm_nodes.recording.messages import array_of, flags, floats, images_of, time_ns
+from wm_nodes.ros.convert import mosaic_msg, set_optional, time_msg, to_field
+from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand
 
 
 def step_request(command: StepCommand) -> StepBatch.Request:
@@ -65,72 +55,56 @@ def reset_command(request: ResetBatch.Request, spec: EnvironmentSpec) -> ResetCo
     )
 
 
-def fill_step_response(
-    response: StepBatch.Response, reply: Reply, spec: EnvironmentSpec, shown: Image | None = None
-) -> StepBatch.Response:
+def fill_response(
+    response: StepBatch.Response | ResetBatch.Response, reply: Reply, spec: EnvironmentSpec, shown: Image | None = None
+) -> Any:
     """shown: the newest published mosaic; sent again where it is the reply's."""
-    response.step_id = reply.step_id
-    response.step_ms = reply.step_s * 1e3
-    response.terminated, response.truncated = to_field(reply.terminated), to_field(reply.truncated)
-    response.success_probability = to_field(reply.success_probability)
-    response.model_uncertainty = to_field(reply.uncertainty)
-    return _fill_common(response, reply, spec, shown)
-
-
-def fill_reset_response(
-    response: ResetBatch.Response, reply: Reply, spec: EnvironmentSpec, shown: Image | None = None
-) -> ResetBatch.Response:
-    """shown: as in fill_step_response."""
-    response.session, response.next_step_id = reply.session, reply.step_id + 1
-    return _fill_common(response, reply, spec, shown)
-
-
-def _fill_common(response: Any, reply: Reply, spec: EnvironmentSpec, shown: Image | None) -> Any:
-    response.error_code = ErrorCode.OK
-    response.stamp = time_msg(reply.stamp_ns)
-    response.state = to_field(reply.states)
-    response.episode_id = to_field(reply.episode_ids)
+    response.error_code, response.stamp = ErrorCode.OK, time_msg(reply.stamp_ns)
+    set_optional(response, state=reply.states, episode_id=reply.episode_ids)
+    if isinstance(response, StepBatch.Response):
+        response.step_id, response.step_ms = reply.step_id, reply.step_s * 1e3
+        set_optional(response, terminated=reply.terminated, truncated=reply.truncated,
+                     success_probability=reply.success_probability, model_uncertainty=reply.uncertainty)
+    else:
+        response.session, response.next_step_id = reply.session, reply.step_id + 1
     if reply.images is not None:
         known = shown is not None and time_ns(shown.header.stamp) == reply.stamp_ns
         response.observation = shown if known else mosaic_msg(reply.images, reply.stamp_ns, spec)
     return response
 
 
-def step_reply(response: StepBatch.Response, spec: EnvironmentSpec, session: int) -> Reply:
-    """Raises WireError with the response's error code, or BAD_SHAPE."""
-    _raise_for(response)
-    count = spec.num_envs
-    return replace(
-        _common_reply(response, spec, session, response.step_id),
-        terminated=flags(response.terminated, count, "terminated"),
-        truncated=flags(response.truncated, count, "truncated"),
-        success_probability=floats(response.success_probability, (count,), "success_probability"),
-        uncertainty=floats(response.model_uncertainty, (count,), "model_uncertainty"), step_s=response.step_ms / 1e3,
-    )
+def reply_of(
+    response: StepBatch.Response | ResetBatch.Response, spec: EnvironmentSpec, session: int | None = None
+) -> Reply:
+    """After a reset nothing has ended or succeeded, and nothing is uncertain.
 
+    Args:
+        session: of the environment, which the answer to a step does not say.
 
-def reset_reply(response: ResetBatch.Response, spec: EnvironmentSpec) -> Reply:
-    """Raises WireError with the response's error code, or BAD_SHAPE."""
-    _raise_for(response)
-    return _common_reply(response, spec, response.session, response.next_step_id - 1)
-
-
-def _common_reply(response: Any, spec: EnvironmentSpec, session: int, step_id: int) -> Reply:
-    """What both answers have; nothing ended, succeeded or is uncertain."""
-    count, zeros = spec.num_envs, np.zeros(spec.num_envs, np.float32)
-    return Reply(
-        session=session, step_id=step_id, stamp_ns=time_ns(response.stamp),
-        images=images_of(response.observation, spec) if len(response.observation.data) else None,
-        states=floats(response.state, (count, spec.state_dim), "state"), terminated=zeros != 0, truncated=zeros != 0,
-        episode_ids=reshape_field(from_field(response.episode_id, np.uint64), (count,), "episode_id"),
-        success_probability=zeros, uncertainty=zeros,
-    )
-
-
-def _raise_for(response: Any) -> None:
+    Raises:
+        WireError: the response's error code, or BAD_SHAPE.
+    """
     if response.error_code != ErrorCode.OK:
         raise WireError(response.error_code, response.message)
+    count, stepped = spec.num_envs, session is not None
+    zeros = np.zeros(count, np.float32)
+
+    def flags_in(name: str) -> Any:
+        return flags(getattr(response, name), count, name) if stepped else zeros != 0
+
+    def floats_in(name: str) -> FloatArray:
+        return floats(getattr(response, name), (count,), name) if stepped else zeros
+
+    return Reply(
+        session=response.session if session is None else session,
+        step_id=response.step_id if stepped else response.next_step_id - 1, stamp_ns=time_ns(response.stamp),
+        images=images_of(response.observation, spec) if len(response.observation.data) else None,
+        states=floats(response.state, (count, spec.state_dim), "state"), terminated=flags_in("terminated"),
+        truncated=flags_in("truncated"), episode_ids=array_of(response.episode_id, np.uint64, (count,), "episode_id"),
+        success_probability=floats_in("success_probability"), uncertainty=floats_in("model_uncertainty"),
+        step_s=response.step_ms / 1e3 if stepped else 0.0,
+    )
 
 
 def _seeds(field: Any, count: int, name: str) -> UInt64Array | None:
-    return reshape_field(from_field(field, np.uint64), (count,), name) if len(field) else None
+    return array_of(field, np.uint64, (count,), name) if len(field) else None

@@ -13,10 +13,11 @@ from rclpy.task import Future
 
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.ros import calls, convert
 from wm_nodes.ros.liveliness import PeerWatch
-from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand, WireError
+from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand
 
 if TYPE_CHECKING:
     from wm_nodes.ros.lifecycle import ManagedNode
@@ -42,19 +43,19 @@ Check = Callable[[], None]
 
 
 def wait_for(future: Future, timeout_s: float, check: Check) -> Any:
-    """Wait in a worker thread for a future that the executor completes.
-
-    Raises:
-        PeerLost: not done after timeout_s.
-    """
+    """Wait in a worker thread for a future that the executor completes. Raises PeerLost: not done after timeout_s."""
     done = threading.Event()
     future.add_done_callback(lambda _: done.set())
+    _wait(done, timeout_s, check, f"no answer within {timeout_s:g} s")
+    return future.result()
+
+
+def _wait(done: threading.Event, timeout_s: float, check: Check, text: str) -> None:
     deadline = time.monotonic() + timeout_s
     while not done.wait(min(POLL_S, max(0.0, deadline - time.monotonic()))):
         check()
         if time.monotonic() >= deadline:
-            raise PeerLost(f"no answer within {timeout_s:g} s")
-    return future.result()
+            raise PeerLost(text)
 
 
 def wait_until(ready: Callable[[], bool], timeout_s: float, check: Check, what: str) -> None:
@@ -130,14 +131,14 @@ class RosEnvironmentClient:
     def reset(self, command: ResetCommand, check: Check) -> Reply:
         # Twice the same reset gives the same observation; a server that has not matched this client's reader yet loses
         # its first answer (rmw_fastrtps 556).
-        read = partial(calls.reset_reply, spec=self._require_spec())
+        read = partial(calls.reply_of, spec=self._require_spec())
         reply = self._ask(self._reset, calls.reset_request(command), read, self._timeout_s / 2, check)
         if reply.session != self._session:
             raise PeerLost(f"the environment was restarted (session {reply.session}, not {self.session})")
         return reply
 
     def step(self, command: StepCommand, check: Check) -> Reply:
-        read = partial(calls.step_reply, spec=self._require_spec(), session=self._session)
+        read = partial(calls.reply_of, spec=self._require_spec(), session=self._session)
         try:
             return self._ask(self._step, calls.step_request(command), read, ATTEMPT_S, check)
         except WireError as error:
@@ -257,11 +258,7 @@ def send_in_executor(node: "ManagedNode", send: Callable[[], Future], timeout_s:
         ready.set()
 
     node.executor.create_task(run)
-    deadline = time.monotonic() + timeout_s
-    while not ready.wait(POLL_S):
-        check()
-        if time.monotonic() >= deadline:
-            raise PeerLost(f"this node's executor did not run for {timeout_s:g} s")
+    _wait(ready, timeout_s, check, f"this node's executor did not run for {timeout_s:g} s")
     return sent[0]
 
 

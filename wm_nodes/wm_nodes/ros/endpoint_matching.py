@@ -10,15 +10,19 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from rclpy.node import Node
 
 from wm_msgs.msg import ErrorCode, NodeLinks
+from wm_nodes.core.errors import WireError
 from wm_nodes.ros.guard import check_sender, nodes_of
 from wm_nodes.ros.publishing import StampedPublisher
 from wm_nodes.ros.qos import topic
-from wm_nodes.ros.wire import WireError
-from wm_nodes.ros.worker import Work, WorkerNode
+from wm_nodes.ros.worker import Work
+
+if TYPE_CHECKING:
+    from wm_nodes.ros.lifecycle import ManagedNode
 
 Ends = Callable[[str], set[str]]
 """Topic name to the nodes (fully qualified) whose end of it is known."""
@@ -27,10 +31,15 @@ Ends = Callable[[str], set[str]]
 @dataclass(frozen=True)
 class _Peer:
     session: int
+    """Of the node."""
     active: bool
+    """Whether it is active."""
     publishes: frozenset[str]
+    """Its topics, absolute."""
     subscribes: frozenset[str]
+    """The topics that it listens to, absolute."""
     linked: frozenset[tuple[str, int]]
+    """The nodes, with their sessions, whose ends it has discovered."""
 
 
 class EndpointTable:
@@ -178,7 +187,7 @@ class StartBarrier:
         table: what this node knows about the links of all nodes.
     """
 
-    def __init__(self, node: WorkerNode, table: EndpointTable) -> None:
+    def __init__(self, node: "ManagedNode", table: EndpointTable) -> None:
         self._node, self._table = node, table
         self._given_up: set[str] = set()
 

@@ -13,8 +13,8 @@ from typing import Any
 from rclpy.serialization import deserialize_message
 
 from wm_msgs.msg import ErrorCode
+from wm_nodes.core.errors import WireError
 from wm_nodes.ros import diagnostics
-from wm_nodes.ros.wire import WireError
 
 LOG_PERIOD_S = 60.0
 UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"

@@ -15,10 +15,11 @@ from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.service_introspection import ServiceIntrospectionState
 
-from wm_msgs.msg import RunState
+from wm_msgs.msg import ErrorCode, RunState
 from wm_nodes.config.load import ConfigError, load_config
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.ros import diagnostics
+from wm_nodes.core.errors import WireError
+from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.diagnostics import Diagnostics
 from wm_nodes.ros.endpoint_matching import Links
 from wm_nodes.ros.flow_control import ConsumerCredits
@@ -28,7 +29,6 @@ from wm_nodes.ros.params import COMMON, Param, declare, refusal
 from wm_nodes.ros.publishing import StampedPublisher
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.sequence_numbers import GapTracker, new_session
-from wm_nodes.ros.wire import WireError
 
 T = TypeVar("T")
 
@@ -144,10 +144,10 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             self.diagnostics.count("refused_parameters", text=f"parameter refused: {result.reason}")
         return result
 
-    def count_refused(self, what: str, error: WireError) -> None:
-        """Log a refused message or request and count it in diagnostics."""
-        self.get_logger().error(f"{what} refused: {error}", throttle_duration_sec=1.0)
-        self.diagnostics.count(f"refused_{what}s", text=f"{what} refused: {error}")
+    def require_active(self) -> None:
+        """Raise WireError(NOT_ACTIVE) unless the node is active."""
+        if not self._active:
+            raise WireError(ErrorCode.NOT_ACTIVE, f"the {self.get_name()} node is not active; activate it first")
 
     def say_failed_goal(self, text: str) -> None:
         """In the log, and counted in diagnostics."""
@@ -200,9 +200,29 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             self.own(credits.close)
         return credits
 
-    def serve(self, service_type: type[Any], name: str, callback: Callable[[Any, Any], Any]) -> None:
-        """A service until cleanup."""
-        service = self.create_service(service_type, name, self.guard.wrap_service(name, callback))
+    def serve(
+        self, service_type: type[Any], name: str, callback: Callable[[Any, Any], Any], *, counted: str = "",
+        code: int = ErrorCode.IO_ERROR,
+    ) -> None:
+        """A service until cleanup.
+
+        Args:
+            counted: a WireError, ValueError or OSError of the callback is the answer, and is counted under this name in
+                diagnostics; empty: the callback refuses by itself.
+            code: of the answer to a ValueError or OSError, except for a file outside the folders.
+        """
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                return callback(request, response)
+            except (WireError, ValueError, OSError) as error:
+                if not counted:
+                    raise
+                refused = convert.refusal_of(error, code)
+                self.diagnostics.count(counted, text=f"{name} refused: {refused}")
+                return convert.fill_error(service_type.Response(), refused)
+
+        service = self.create_service(service_type, name, self.guard.wrap_service(name, answer))
         self._introspect(service, str(self.param("service_introspection")))
         self._introspected.append(service)
         self.own(self.destroy_service, service)

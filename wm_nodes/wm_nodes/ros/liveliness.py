@@ -16,11 +16,11 @@ from typing import Any
 from rclpy.duration import Duration
 
 from wm_msgs.msg import ErrorCode, RunState
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.processes import Activity, ActivityWatch
 from wm_nodes.ros import diagnostics
 from wm_nodes.ros.guard import check_sender
 from wm_nodes.ros.qos import topic
-from wm_nodes.ros.wire import WireError
 
 HEARTBEAT_S = 0.5
 ASLEEP_S = 3 * HEARTBEAT_S

@@ -5,19 +5,8 @@ Shapes: N environments, A action, S state, P ground truth, H W 3 image. Stamps i
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from wm_nodes.core.errors import RunError
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array, UInt64Array
-
-
-class WireError(Exception):
-    """A refused request: code is one of wm_msgs/ErrorCode, the text names the value and the remedy."""
-
-    def __init__(self, code: int, text: str) -> None:
-        super().__init__(text)
-        self.code = code
 
 
 class PeerLost(RunError):
@@ -30,113 +19,88 @@ class Cancelled(Exception):
 
 @dataclass(frozen=True)
 class StepCommand:
-    """StepBatch's request. actions: (N * A,), row-major. Optional arrays: (N,) or None."""
+    """StepBatch's request."""
 
     session: int
+    """Of the environment, from the handshake."""
     step_id: int
+    """The next one, or the last one again."""
     spec_hash: str
+    """Of the spec that the caller was built for."""
     actions: FloatArray
+    """(N * A,), row-major, in [-1, 1]."""
     policy_version: int = 0
+    """Weights that chose the actions; 0: no numbered ones."""
     logprobs: FloatArray | None = None
+    """(N,) nats; None where unknown."""
     values: FloatArray | None = None
+    """(N,); None where unknown."""
     reset_mask: BoolArray | None = None
+    """(N,), reset instead of stepped; None: nobody."""
     reset_seeds: UInt64Array | None = None
+    """(N,); None: the environment draws them."""
     with_image: bool = True
+    """Whether the answer carries the images."""
 
 
 @dataclass(frozen=True)
 class ResetCommand:
-    """ResetBatch's request. Optional arrays: (N,) or None."""
+    """ResetBatch's request."""
 
     mask: BoolArray | None = None
+    """(N,), who is reset; None: all."""
     seeds: UInt64Array | None = None
+    """(N,); None: the environment draws them."""
     task: str = ""
+    """Must be the served one; empty: not checked."""
     behaviour: str = ""
+    """Label of the episode events; empty: as before."""
     with_image: bool = True
+    """Whether the answer carries the images."""
 
 
 @dataclass(frozen=True)
 class Reply:
-    """The answer to a step or a reset. images: (N, H, W, 3), or None when not asked for. step_s: s inside."""
+    """The answer to a step or a reset."""
 
     session: int
+    """Of the environment."""
     step_id: int
     """The step answered; after a reset the last one before it, so step_id + 1 comes next in both cases."""
     stamp_ns: int
+    """When the observation returned was made."""
     images: UInt8Array | None
+    """(N, H, W, 3); None when not asked for."""
     states: FloatArray
+    """(N, S)."""
     terminated: BoolArray
+    """(N,), the task is over."""
     truncated: BoolArray
+    """(N,), cut, or ended from outside until it is reset."""
     episode_ids: UInt64Array
+    """(N,), of the observation returned."""
     success_probability: FloatArray
+    """(N,), as in LockStep."""
     uncertainty: FloatArray
+    """(N,), as in LockStep."""
     step_s: float = 0.0
+    """Inside the environment, s."""
 
 
 @dataclass(frozen=True)
 class TimedAction:
-    """ActionBatch, for an environment that steps on its own clock. actions: (N * A,). logprobs, values: (N,) or None.
-
-    stamp_ns: of the observation it answers; 0: it answers none (a person's), and its age counts from arrival.
-    """
+    """ActionBatch, for an environment that steps on its own clock."""
 
     actions: FloatArray
+    """(N * A,), row-major."""
     stamp_ns: int
+    """Of the observation it answers; 0: it answers none (a person's), and its age counts from arrival."""
     policy_version: int = 0
+    """Weights that chose the actions; 0: no numbered ones."""
     logprobs: FloatArray | None = None
+    """(N,) nats; None where unknown."""
     values: FloatArray | None = None
-
-
-@dataclass(frozen=True)
-class Transition:
-    """TransitionBatch. ground_truth: (N, P), or (N, 0) where unknown."""
-
-    stamp_ns: int
-    next_stamp_ns: int
-    step_id: int
-    actions: FloatArray
-    states: FloatArray
-    next_states: FloatArray
-    logprobs: FloatArray
-    values: FloatArray
-    terminated: BoolArray
-    truncated: BoolArray
-    valid: BoolArray
-    episode_ids: UInt64Array
-    episode_steps: NDArray[np.uint32]
-    policy_versions: UInt64Array
-    success_probability: FloatArray
-    uncertainty: FloatArray
-    ground_truth: FloatArray
-    source: int
-    session: int = 0
-
-    @property
-    def is_reset(self) -> bool:
-        """True for the transition that env/reset publishes: no action, both stamps those of the first frame."""
-        return self.stamp_ns == self.next_stamp_ns
-
-
-@dataclass(frozen=True)
-class Rewards:
-    """What a learner reads of a RewardBatch; arrays (N,)."""
-
-    transition_session: int
-    step_id: int
-    total: FloatArray
-    valid: BoolArray
-    success: UInt8Array
-    invalid_reason: str
-
-
-@dataclass(frozen=True)
-class Goals:
-    """TaskGoal. images: (N, H, W, 3), or None where the environment has no goals. found: bool (N,)."""
-
-    stamp_ns: int
-    images: UInt8Array | None
-    found: BoolArray
-    episode_ids: UInt64Array
+    """(N,); None where unknown."""
 
 
 @dataclass(frozen=True)
@@ -144,13 +108,24 @@ class EpisodeNote:
     """EpisodeEvent. Constants of the message are used for kind, outcome and reason."""
 
     stamp_ns: int
+    """Of the observation that it begins or ends with."""
     kind: int
+    """KIND_*."""
     env_index: int
+    """Environment, from 0."""
     episode_id: int
+    """Of the episode."""
     seed: int
+    """Of its reset."""
     behaviour: str
+    """Who acts."""
     length: int
+    """Steps made."""
     outcome: int
+    """OUTCOME_*."""
     reason: int
+    """REASON_*, why it ended."""
     policy_version_first: int
+    """That chose its first action."""
     policy_version_last: int
+    """That chose its newest action."""

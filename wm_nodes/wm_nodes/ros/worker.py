@@ -1,42 +1,23 @@
-"""One goal at work in a thread, and what such work needs of its node."""
+"""One goal at work in a thread."""
 
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
-from wm_nodes.ros.diagnostics import Diagnostics
 from wm_nodes.ros.wire import Cancelled
-
-
-class WorkerNode(Protocol):
-    """A node whose work runs in a thread; ros.lifecycle.ManagedNode is one."""
-
-    diagnostics: Diagnostics
-    actions: list[Any]
-    """The WorkerActions that it serves."""
-
-    @property
-    def active(self) -> bool: ...
-
-    def param(self, name: str) -> Any: ...
-
-    def say_failed_goal(self, text: str) -> None: ...
-
-    def own(self, destroy: Callable[..., object], *arguments: Any) -> None: ...
-
-    def get_logger(self) -> Any: ...
-
-    def get_namespace(self) -> str: ...
 
 
 @dataclass
 class Work:
-    """One goal at work. request: the goal message; feedback(message) publishes feedback."""
+    """One goal at work."""
 
     request: Any
+    """The goal message."""
     feedback: Callable[[Any], None]
+    """Publishes a feedback message."""
     _stop: threading.Event
+    """Set when it must stop."""
     reason: str = ""
     """Why it must stop: "cancelled", "deactivated", ...; empty while it may go on."""
 

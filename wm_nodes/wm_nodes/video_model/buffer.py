@@ -6,7 +6,7 @@ Shapes: N videos, S stochastic steps. The file is one safetensors; nothing in it
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -14,9 +14,10 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
+from wm_nodes.config.video import RolloutConfig
 from wm_nodes.training.checkpoint import metadata_of
 from wm_nodes.video_model.conditions import Condition
-from wm_nodes.video_model.sampling import RolloutSettings, VideoRollout
+from wm_nodes.video_model.sampling import VideoRollout
 
 _METADATA_KEY = "rollout_buffer"
 _ROWS = ("latents", "states", "mask", "sigma_base", "zeta", "seeds")
@@ -27,11 +28,9 @@ class RolloutBufferError(ValueError):
     """A buffer that is damaged, stale, or was made with other sampler settings."""
 
 
-def config_hash(settings: RolloutSettings) -> str:
+def config_hash(settings: RolloutConfig) -> str:
     """Return the sha256 of what decides the Gaussian of a transition; storage_dtype does, since it rounds states."""
-    knobs = asdict(settings)
-    for name in ("micro_batch", "noise_store", "buffer_device"):
-        knobs.pop(name)
+    knobs = settings.model_dump(exclude={"micro_batch", "noise_store", "buffer_device"})
     return hashlib.sha256(json.dumps(knobs, sort_keys=True).encode()).hexdigest()
 
 
@@ -39,23 +38,27 @@ def config_hash(settings: RolloutSettings) -> str:
 class RolloutBuffer:
     """N videos in groups of one context each.
 
-    condition: of every video (rows repeat within a group). group_ids, sample_ids: int64 (N,). rewards: raw values by
-    name, float64 (N,), NaN where missing. valid: bool (N,), False where any reward is missing or was refused.
-    policy_version: optimizer steps of the weights that sampled. iteration: of the training run.
-
-    rollout and condition may lie on any device; what says which video is which, the rewards and `valid` are in the
-    host's memory.
+    rollout and condition may lie on any device; the others are in the host's memory.
     """
 
     rollout: VideoRollout
+    """The videos."""
     condition: Condition
+    """Of every video; rows repeat within a group."""
     group_ids: Tensor
+    """int64 (N,)."""
     sample_ids: Tensor
+    """Place in the group, int64 (N,)."""
     rewards: Mapping[str, Tensor]
+    """Raw values by name, float64 (N,), NaN where missing."""
     valid: Tensor
+    """bool (N,), False where any reward is missing or was refused."""
     policy_version: int
+    """Optimizer steps of the weights that sampled."""
     iteration: int
+    """Of the training run."""
     config_hash: str
+    """Of the settings that sampled, see config_hash()."""
 
     def __len__(self) -> int:
         return len(self.group_ids)
@@ -83,7 +86,7 @@ class RolloutBuffer:
             valid &= torch.isfinite(value)
         return replace(self, rewards=values, valid=valid)
 
-    def check(self, settings: RolloutSettings, policy_version: int, max_staleness: int) -> None:
+    def check(self, settings: RolloutConfig, policy_version: int, max_staleness: int) -> None:
         """Raise RolloutBufferError if the buffer was sampled with other settings, or by weights that are too old."""
         wanted = config_hash(settings)
         if self.config_hash != wanted:
@@ -121,9 +124,8 @@ class RolloutBuffer:
         """Raises RolloutBufferError where the bytes are no rollout buffer, a truncated one, or one with a value
         of a video that is no number."""
         try:
-            tensors: dict[str, Any] = load(data)
+            tensors: dict[str, Tensor] = load(data)
             header = json.loads(metadata_of(data)[_METADATA_KEY])
-            tensors.setdefault("rollout.zeta", None)  # absent where only seeds are kept
             rollout = {name: tensors[f"rollout.{name}"] for name in _ROLLOUT_TENSORS}
             for name, values in tensors.items():
                 if name.startswith("condition.") or name.removeprefix("rollout.") in _ROWS:
@@ -152,11 +154,11 @@ class RolloutBuffer:
         tensors |= {f"condition.{name}": getattr(self.condition, name) for name in ("frames", "actions", "text")}
         tensors |= {f"reward.{name}": value for name, value in self.rewards.items()}
         tensors |= {"group_ids": self.group_ids, "sample_ids": self.sample_ids, "valid": self.valid}
-        return {name: tensor.contiguous() for name, tensor in tensors.items() if tensor is not None}
+        return {name: tensor.contiguous() for name, tensor in tensors.items()}
 
 
-def _check_finite(name: str, values: Tensor | None) -> None:
-    if values is not None and not bool(torch.isfinite(values).all()):
+def _check_finite(name: str, values: Tensor) -> None:
+    if not bool(torch.isfinite(values).all()):
         video = int((~torch.isfinite(values)).flatten(1).any(1).nonzero()[0])
         raise RolloutBufferError(
             f"video {video} of the buffer has a value in {name} that is no number; lower the learning rate, or begin "
@@ -183,9 +185,10 @@ def concatenate_buffers(parts: Sequence[RolloutBuffer]) -> RolloutBuffer:
     shares = torch.tensor([len(part) for part in parts]) / sum(map(len, parts))
     squares = torch.stack([rollout.noise_share.cpu().square() for rollout in rollouts])
     noise_share = (shares.unsqueeze(1) * squares).sum(0).sqrt()
+    rows: dict[str, Any] = {name: _cat(rollouts, name) for name in _ROWS}
     return replace(
         first,
-        rollout=replace(first.rollout, **{name: _cat(rollouts, name) for name in _ROWS}, noise_share=noise_share),
+        rollout=replace(first.rollout, noise_share=noise_share, **rows),
         condition=Condition(*(_cat(conditions, name) for name in ("frames", "actions", "text"))),
         group_ids=torch.cat([part.group_ids for part in parts]),
         sample_ids=torch.cat([part.sample_ids for part in parts]),
@@ -194,6 +197,5 @@ def concatenate_buffers(parts: Sequence[RolloutBuffer]) -> RolloutBuffer:
     )
 
 
-def _cat(parts: Sequence[Any], name: str) -> Any:
-    values = [getattr(part, name) for part in parts]
-    return None if values[0] is None else torch.cat(values)
+def _cat(parts: Sequence[Any], name: str) -> Tensor:
+    return torch.cat([getattr(part, name) for part in parts])

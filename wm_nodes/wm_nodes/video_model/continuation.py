@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from wm_nodes.config.video import RolloutConfig
 from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.network import VelocityModel
-from wm_nodes.video_model.sampling import RolloutSettings, sample_videos
+from wm_nodes.video_model.sampling import sample_videos
 
 ClipNoise = Callable[[int, tuple[int, ...]], Tensor]
 """(number of the clip, shape (C, K + n, h, w)) -> its initial noise (N, C, K + n, h, w)."""
@@ -51,7 +52,7 @@ def clip_condition(videos: Tensor, actions: Tensor, text: Tensor, lengths: ClipL
 @torch.no_grad()
 def continue_videos(
     model: VelocityModel, videos: Tensor, actions: Tensor, text: Tensor, lengths: ClipLengths, frames: int,
-    noise: ClipNoise, settings: RolloutSettings,
+    noise: ClipNoise, settings: RolloutConfig,
 ) -> Tensor:
     """Return `videos` (N, C, F, h, w) continued to `frames` frames, clip after clip by ODE; the last may be shorter.
 

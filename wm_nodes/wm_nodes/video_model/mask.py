@@ -4,12 +4,11 @@ Shapes: B batch, C channels, F latent frames, H W latent grid. The mask is (B, 1
 Everything is computed without gradient from the clean estimate x0 of the same forward pass.
 """
 
-from dataclasses import dataclass
-from typing import Literal
-
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
+
+from wm_nodes.config.video import MaskConfig
 
 STATIC_SHARE = 1e-6
 """A video whose largest residual is below this share of its rms counts as still."""
@@ -17,32 +16,8 @@ _TINY = 1e-30
 _LEAST_NORMAL = torch.finfo(torch.float32).tiny
 
 
-@dataclass(frozen=True)
-class MaskSettings:
-    """Of the mask; config/video.py explains them one by one. m_min is in (0, 1]."""
-
-    m_min: float = 0.2
-    quantile: float = 0.8
-    combine: Literal["gated", "sparse", "convex", "max"] = "gated"
-    convex_share: float = 0.5
-    channel_norm: Literal["rms", "l1", "max"] = "rms"
-    norm: Literal["max", "q99"] = "max"
-    norm_scope: Literal["sample", "frame"] = "sample"
-    diff: Literal["backward", "central"] = "backward"
-    budget: Literal["literal", "rms", "peak"] = "literal"
-    time_limit: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name in ("m_min", "quantile", "convex_share"):
-            value = getattr(self, name)
-            if not 0 <= value <= 1:
-                raise ValueError(f"{name} must be in [0, 1], got {value}")
-        if self.m_min == 0:
-            raise ValueError("m_min must be > 0: a cell without noise has no density; take 0.05 for very little")
-
-
 @torch.no_grad()
-def dynamic_mask(x0_BCFHW: Tensor, num_conditioning: int, settings: MaskSettings) -> Tensor:
+def dynamic_mask(x0_BCFHW: Tensor, num_conditioning: int, settings: MaskConfig) -> Tensor:
     """Return the mask M of DD-9, budgeted by DD-9b: 0 on conditioning frames, positive on generated ones.
 
     Args:
@@ -57,20 +32,23 @@ def dynamic_mask(x0_BCFHW: Tensor, num_conditioning: int, settings: MaskSettings
         ones[:, :, :num_conditioning] = 0
         return ones
     x0 = x0_BCFHW.float()
-    intensity = _channel_norm(residual(x0, settings.diff, num_conditioning), settings.channel_norm)
+    intensity = residual(x0, num_conditioning).square_().mean(1, keepdim=True).sqrt_()
     peak = intensity.flatten(1).amax(1)
     rms = torch.linalg.vector_norm(x0, dim=(1, 2, 3, 4)) / (C * F * H * W) ** 0.5
     still = _rows((peak <= STATIC_SHARE * rms).float())
-    normalised = _normalise(intensity, peak, settings)
+    normalised = (intensity.reshape(B, -1) / peak.clamp_min(_TINY).unsqueeze(1)).reshape(intensity.shape)
     threshold = quantile(normalised.flatten(1), settings.quantile)
     threshold = threshold.clamp_min(_LEAST_NORMAL)  # one of 0 would call still cells dynamic
     prior = torch.ge(normalised, _rows(threshold), out=torch.empty_like(normalised))
-    mask = _budget(_combine(normalised, prior, settings), prior, settings.budget)
+    level = prior.clone() if settings.combine == "sparse" else normalised * prior
+    mask = level.mul_(1 - settings.m_min).add_(settings.m_min)
+    if settings.budget == "rms":
+        mask = mask / mask.square().mean((1, 2, 3, 4), keepdim=True).sqrt().clamp_min(_TINY)
     mask.mul_(1 - still).add_(still)  # 1 where the video is still
     return pad(mask, (0, 0, 0, 0, num_conditioning, 0))
 
 
-def residual(x0_BCFHW: Tensor, diff: str = "backward", num_conditioning: int = 0) -> Tensor:
+def residual(x0_BCFHW: Tensor, num_conditioning: int = 0) -> Tensor:
     """Return r of DD-6 for the frames after the conditioning ones: temporal difference less its mean over the frame.
 
     A first frame has no predecessor and takes the second one's residual. The spatial mean removes a change of global
@@ -80,9 +58,6 @@ def residual(x0_BCFHW: Tensor, diff: str = "backward", num_conditioning: int = 0
     change = seen[:, :, 1:] - seen[:, :, :-1]
     if num_conditioning == 0:
         change = torch.cat([change[:, :, :1], change], 2)
-    if diff == "central":
-        forward = torch.cat([change[:, :, 1:], change[:, :, -1:]], 2)
-        change = (change + forward) / 2
     return change.sub_(change.mean((3, 4), keepdim=True))
 
 
@@ -99,51 +74,6 @@ def quantile(values_BU: Tensor, q: float) -> Tensor:
     neighbours = upper.topk(min(2, U - below), 1, largest=False).values.view(torch.float32)
     low, high = neighbours[:, 0], neighbours[:, -1]
     return low if position == below else low + (position - below) * (high - low)
-
-
-def _channel_norm(residual_BCFHW: Tensor, kind: str) -> Tensor:
-    """DD-7, in place of the residual."""
-    if kind == "rms":
-        return residual_BCFHW.square_().mean(1, keepdim=True).sqrt_()
-    magnitude = residual_BCFHW.abs_()
-    return magnitude.mean(1, keepdim=True) if kind == "l1" else magnitude.amax(1, keepdim=True)
-
-
-def _normalise(intensity: Tensor, peak_B: Tensor, settings: MaskSettings) -> Tensor:
-    B, _, F, _, _ = intensity.shape
-    whole = settings.norm_scope == "sample"
-    rows = intensity.reshape(B if whole else B * F, -1)
-    if settings.norm == "q99":
-        normalised = (rows / _divisor(quantile(rows, 0.99))).clamp_max_(1.0)
-    else:
-        normalised = rows / _divisor(peak_B if whole else rows.amax(1))
-    return normalised.reshape(intensity.shape)
-
-
-def _divisor(scale_R: Tensor) -> Tensor:
-    return scale_R.clamp_min(_TINY).unsqueeze(1)
-
-
-def _combine(intensity: Tensor, prior: Tensor, settings: MaskSettings) -> Tensor:
-    floor, share = settings.m_min, settings.convex_share
-    if settings.combine == "max":
-        return (intensity * prior).clamp_min(floor)
-    if settings.combine == "gated":
-        level = intensity * prior
-    else:
-        level = prior.clone() if settings.combine == "sparse" else share * intensity + (1 - share) * prior
-    return level.mul_(1 - floor).add_(floor)
-
-
-def _budget(mask: Tensor, prior: Tensor, budget: str) -> Tensor:
-    if budget == "literal":
-        return mask
-    dims = (1, 2, 3, 4)
-    if budget == "rms":
-        mean_square = mask.square().mean(dims, keepdim=True)
-    else:
-        mean_square = (mask.square() * prior).sum(dims, keepdim=True) / prior.sum(dims, keepdim=True).clamp_min(1)
-    return mask / mean_square.sqrt().clamp_min(_TINY)
 
 
 def _rows(values_B: Tensor) -> Tensor:

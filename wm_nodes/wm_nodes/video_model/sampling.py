@@ -4,79 +4,44 @@ Shapes: N videos, S stochastic steps, L kept latents, C channels, F latent frame
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
 
 import torch
 from torch import Tensor
 
+from wm_nodes.config.video import RolloutConfig
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.video_model.conditions import Condition
-from wm_nodes.video_model.kernels import SamplerSettings, Step, StepContext, ode_step, step, with_conditioning
+from wm_nodes.video_model.kernels import Step, StepContext, ode_step, step, with_conditioning
 from wm_nodes.video_model.network import VelocityModel, guided_velocity
 from wm_nodes.video_model.schedule import flow_times
 
 
 @dataclass(frozen=True)
-class RolloutSettings:
-    """How videos are sampled.
-
-    cfg: guidance g of v_u + g (v_c - v_u); 1 is off. storage_dtype: of the kept latents; x_s is rounded to it before
-    its log-probability is taken. noise_store: keep the normalised noise of each step (zeta: exact, as large as the
-    latents; zeta_bfloat16: half as large, with a KL of 1e-6 at its own anchor), or only the seed it was drawn from
-    (seed: no memory; needs float32 latents). micro_batch: videos per network call. buffer_device: where the rollout is
-    kept, beside the model or in the host's memory.
-    """
-
-    num_steps: int = 10
-    shift: float = 1.0
-    cfg: float = 1.0
-    sampler: SamplerSettings = field(default_factory=SamplerSettings)
-    storage_dtype: Literal["float32", "bfloat16"] = "float32"
-    noise_store: Literal["zeta", "zeta_bfloat16", "seed"] = "zeta"
-    micro_batch: int = 16
-    buffer_device: Literal["model", "cpu"] = "model"
-
-    def __post_init__(self) -> None:
-        if self.noise_store == "seed" and self.storage_dtype != "float32":
-            raise ValueError(
-                "noise_store seed needs storage_dtype float32: what rounding x_s changes cannot be drawn again"
-            )
-        if self.micro_batch < 1:
-            raise ValueError(f"micro_batch must be >= 1, got {self.micro_batch}")
-
-    @property
-    def times(self) -> Tensor:
-        return flow_times(self.num_steps, self.shift)
-
-    def trains_at(self, k: int) -> bool:
-        """Whether step k can have a density: it has noise, and does not end in clean data."""
-        return 0 <= k < self.num_steps - 1 and self.sampler.arm != "ode" and self.sampler.eta > 0
-
-
-@dataclass(frozen=True)
 class VideoRollout:
-    """N sampled videos and the transitions that can be trained on.
-
-    latents: the clean result (N, C, F, H, W), float32. steps: the stochastic steps k, ascending. states: x at the steps
-    of state_steps (N, L, C, F, H, W); transition k leads from state k to state k + 1. mask: (N, S, 1, F, H, W).
-    sigma_base: (N, S). zeta: (N, S, C, F - K, H, W), float32 or bfloat16, or None where only seeds are kept. seeds:
-    int64 (N,).
-    noise_share: rms of std / s over generated elements, (S,), the noise budget that was spent. times: of the sampler,
-    float64 (T + 1,); step k leads from times[k] to times[k + 1].
-    """
+    """N sampled videos and the transitions that can be trained on."""
 
     latents: Tensor
+    """The clean result (N, C, F, H, W), float32."""
     steps: tuple[int, ...]
+    """The stochastic steps k, ascending."""
     state_steps: tuple[int, ...]
+    """Those of `states`; transition k leads from state k to state k + 1."""
     states: Tensor
+    """x before each of state_steps (N, L, C, F, H, W)."""
     mask: Tensor
+    """(N, S, 1, F, H, W)."""
     sigma_base: Tensor
-    zeta: Tensor | None
+    """(N, S)."""
+    zeta: Tensor
+    """Normalised noise (N, S, C, F - K, H, W), float32 or bfloat16."""
     seeds: Tensor
+    """Of each video's step noise, int64 (N,)."""
     noise_share: Tensor
+    """rms of std / s over generated elements, (S,), the noise budget that was spent."""
     times: Tensor
+    """Of the sampler, float64 (T + 1,); step k leads from times[k] to times[k + 1]."""
 
     @property
     def spent_noise(self) -> float:
@@ -85,14 +50,13 @@ class VideoRollout:
 
     def rows(self, index: Tensor | slice) -> "VideoRollout":
         """Some of the videos, as views for a slice; noise_share is that of all."""
-        tensors = {name: getattr(self, name)[index] for name in ("latents", "states", "mask", "sigma_base", "seeds")}
-        return replace(self, **tensors, zeta=None if self.zeta is None else self.zeta[index])
+        names = ("latents", "states", "mask", "sigma_base", "zeta", "seeds")
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
 
     def to(self, device: torch.device | str) -> "VideoRollout":
         """The same videos on a device; seeds and times stay in the host's memory."""
         names = ("latents", "states", "mask", "sigma_base", "noise_share", "zeta")
-        tensors = {name: tensor.to(device) for name in names if (tensor := getattr(self, name)) is not None}
-        return replace(self, **tensors)
+        return replace(self, **{name: getattr(self, name).to(device) for name in names})
 
     def state(self, k: int) -> Tensor:
         """x before step k, (N, C, F, H, W), storage dtype."""
@@ -115,7 +79,7 @@ def sample_videos(
     condition: Condition,
     noise: Tensor,
     seeds: Tensor,
-    settings: RolloutSettings,
+    settings: RolloutConfig,
     stochastic: list[int] | None = None,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> VideoRollout:
@@ -138,7 +102,8 @@ def sample_videos(
             f"steps {outside} cannot be stochastic; of {settings.num_steps} steps all but the last, 0 to "
             f"{settings.num_steps - 2}, can"
         )
-    chosen = [k for k in chosen if settings.trains_at(k)]
+    if settings.sampler.arm == "ode" or settings.sampler.eta == 0:
+        chosen = []  # no step has noise
     rollout = _unsampled(noise, seeds, condition.num_conditioning, settings, chosen)
     spent = torch.zeros(len(chosen), device=noise.device)
     for i in range(0, len(noise), settings.micro_batch):
@@ -151,7 +116,7 @@ def sample_videos(
 
 
 def _unsampled(
-    noise: Tensor, seeds: Tensor, num_conditioning: int, settings: RolloutSettings, stochastic: list[int]
+    noise: Tensor, seeds: Tensor, num_conditioning: int, settings: RolloutConfig, stochastic: list[int]
 ) -> VideoRollout:
     """A rollout whose tensors are yet to be written, in place: kept once, without copies of its parts."""
     N, C, frames, H, W = noise.shape
@@ -166,18 +131,18 @@ def _unsampled(
         states=room(N, len(steps), C, frames, H, W, dtype=getattr(torch, settings.storage_dtype)),
         mask=room(N, S, 1, frames, H, W),
         sigma_base=room(N, S),
-        zeta=None if settings.noise_store == "seed" else room(N, S, C, frames - num_conditioning, H, W, dtype=kept),
+        zeta=room(N, S, C, frames - num_conditioning, H, W, dtype=kept),
         seeds=seeds.clone(),
         noise_share=room(S),
-        times=settings.times,
+        times=flow_times(settings.num_steps, settings.shift),
     )
 
 
 def _sample(
-    model: VelocityModel, condition: Condition, noise: Tensor, settings: RolloutSettings, rollout: VideoRollout
+    model: VelocityModel, condition: Condition, noise: Tensor, settings: RolloutConfig, rollout: VideoRollout
 ) -> Tensor:
     """Sample one micro-batch into its rows of `rollout`; return the squared noise_share of its steps, (S,)."""
-    times, N = settings.times, len(noise)
+    times, N = rollout.times, len(noise)
     at = times.to(noise.device)
     storage = getattr(torch, settings.storage_dtype)
     context = StepContext(condition.frames.float(), first_time=float(times[1]))
@@ -212,12 +177,11 @@ def keep_transition(rollout: VideoRollout, k: int, x_s: Tensor, law: Step) -> No
     i = rollout.steps.index(k)
     rollout.mask[:, i] = law.mask
     rollout.sigma_base[:, i] = law.sigma_base
-    if rollout.zeta is not None:
-        num_conditioning = x_s.shape[2] - rollout.zeta.shape[3]
-        if rollout.zeta.dtype == torch.float32 and rollout.zeta.device == x_s.device:
-            normalised_noise(x_s, law, num_conditioning, out=rollout.zeta[:, i])
-        else:
-            rollout.zeta[:, i] = normalised_noise(x_s, law, num_conditioning)
+    num_conditioning = x_s.shape[2] - rollout.zeta.shape[3]
+    if rollout.zeta.dtype == torch.float32 and rollout.zeta.device == x_s.device:
+        normalised_noise(x_s, law, num_conditioning, out=rollout.zeta[:, i])
+    else:
+        rollout.zeta[:, i] = normalised_noise(x_s, law, num_conditioning)
 
 
 def normalised_noise(x_s: Tensor, law: Step, num_conditioning: int, out: Tensor | None = None) -> Tensor:

@@ -3,19 +3,11 @@
 Steps are numbered 0 to T - 1; the last one (s = 0) is never stochastic, so T - 1 steps can be.
 """
 
-import math
-from typing import Literal
-
 import torch
 from torch import Tensor
 
 from wm_nodes.config.video import WindowConfig
 from wm_nodes.core.seeding import numpy_stream, torch_stream
-
-DECAY_FROM = 13
-DECAY_RATE = 0.1
-LEAST_STAY = 4
-"""With strategy decay the stay of a window falls towards this part of the period."""
 
 
 def stochastic_steps(num_steps: int, settings: WindowConfig, iteration: int, seed: int) -> list[int]:
@@ -30,21 +22,17 @@ def stochastic_steps(num_steps: int, settings: WindowConfig, iteration: int, see
     if settings.strategy in ("random", "fast"):
         high = last_start if settings.strategy == "random" else min(last_start, max(0, num_steps // 2 - settings.size))
         start = int(numpy_stream(seed, "sde_window", iteration).integers(high + 1))
-    elif settings.strategy == "progressive":
-        start = (iteration // settings.period) % (last_start + 1)
     else:
-        start = _find_decayed_start(iteration, settings, last_start, num_steps)
+        start = (iteration // settings.period) % (last_start + 1)
     return list(range(start, start + settings.size))
 
 
 def select_steps(
-    times: Tensor, stochastic: list[int], num_samples: int, *, fraction: float,
-    select: Literal["random", "first", "tmin"], min_s: float, seed: int, iteration: int,
+    times: Tensor, stochastic: list[int], num_samples: int, *, fraction: float, min_s: float, seed: int, iteration: int
 ) -> Tensor:
-    """Return which of the stochastic steps train, bool (N, S).
+    """Return which of the stochastic steps train, bool (N, S): floor(fraction S) per sample without replacement.
 
-    random: floor(fraction S) steps per sample without replacement; first: the first of them; tmin: those with
-    t >= fraction. At least one step stays. Steps that end below min_s never train.
+    At least one step stays. Steps that end below min_s never train.
     """
     usable = torch.tensor([float(times[k + 1]) >= min_s for k in stochastic], dtype=torch.bool)
     if not stochastic or not bool(usable.any()):
@@ -54,33 +42,9 @@ def select_steps(
         )
     S, candidates = len(stochastic), torch.nonzero(usable).flatten()
     chosen = torch.zeros(num_samples, S, dtype=torch.bool)
-    if select == "tmin":
-        late = [i for i in candidates.tolist() if float(times[stochastic[i]]) >= fraction]
-        chosen[:, late or candidates[:1].tolist()] = True
-        return chosen
     count = min(len(candidates), max(1, int(fraction * S)))
     for sample in range(num_samples):
         generator = torch_stream(seed, "step_selection", iteration, sample)
-        random = select == "random"
-        order = torch.randperm(len(candidates), generator=generator) if random else torch.arange(len(candidates))
+        order = torch.randperm(len(candidates), generator=generator)
         chosen[sample, candidates[order[:count]]] = True
     return chosen
-
-
-def _find_decayed_start(iteration: int, settings: WindowConfig, last_start: int, num_steps: int) -> int:
-    """Return the start of a window that stays ever shorter (Mix-GRPO's formulas) and begins again after the last."""
-    period, least = settings.period, max(1, settings.period // LEAST_STAY)
-
-    def stay(start: int) -> int:
-        if settings.strategy == "exp_decay":
-            return math.ceil(period * math.exp(-DECAY_RATE * max(0, start - DECAY_FROM)))
-        share = start / (num_steps - 2)
-        return max(least, int(period * (1 - share) + least * share))
-
-    stays = [stay(start) for start in range(last_start + 1)]
-    left = iteration % sum(stays)
-    for start, iterations in enumerate(stays):
-        if left < iterations:
-            return start
-        left -= iterations
-    raise AssertionError("unreachable: left < sum(stays)")

@@ -10,13 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from wm_nodes.config.load import load_video_config
 from wm_nodes.config.schema import RewardConfig, VideoEnvironmentConfig
 from wm_nodes.core.seeding import stream_seed
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.video_model.conditions import Condition, hashed_words
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_model.sampling import RolloutSettings, initial_noise, sample_videos
+from wm_nodes.video_model.sampling import initial_noise, sample_videos
 from wm_nodes.world_model.imagined_episodes import DeviceEpisodes, ImaginedEpisodes, imagined_spec, put_where
 from wm_nodes.world_model.parts import in_parallel
 from wm_nodes.world_model.precision import compute_context
@@ -47,7 +48,9 @@ class VideoEpisodes(DeviceEpisodes):
         super().__init__(imagined_spec(spec, f"video/{spec.task}", folder.sha256, num_envs), starts, reward, device)
         self.folder, self._reader, self._exact = folder, reader, exact
         self._rows = ROWS if device.type == "cpu" else num_envs
-        self._sampler = RolloutSettings(settings.num_steps, settings.shift, micro_batch=self._rows)
+        self._sampler = load_video_config("base").rollout.with_values(
+            num_steps=settings.num_steps, shift=settings.shift, micro_batch=self._rows
+        )
         self._start_latents = folder.codec.encode(torch.from_numpy(starts[0]).unsqueeze(1)).to(device)
         self.latent_shape = tuple(self._start_latents.shape[1:])
         self._text = hashed_words((spec.instruction,), folder.network.settings.text_dim).to(device)

@@ -3,22 +3,22 @@
 Shapes: N videos (a few), C channels, F latent frames, H W latent grid.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 
 from wm_nodes.config.load import load_video_config
-from wm_nodes.config.video import GrpoConfig
+from wm_nodes.config.video import GrpoConfig, RolloutConfig
 from wm_nodes.core.device import device_of
 from wm_nodes.video_model import (
     Condition,
     RolloutBuffer,
-    RolloutSettings,
     StepContext,
     VideoRollout,
     config_hash,
+    flow_times,
     guided_velocity,
     initial_noise,
     sample_videos,
@@ -37,16 +37,20 @@ MIB = 2**20
 
 @dataclass(frozen=True)
 class CheckResult:
-    """One check. value: what was measured, as text. remedy: what to do where it failed."""
+    """One check."""
 
     name: str
+    """In words."""
     passed: bool
+    """Whether what was measured is within the limit."""
     value: str
+    """What was measured, as text."""
     remedy: str
+    """What to do where it failed."""
 
 
 def examine(
-    model: nn.Module, condition: Condition, shape: tuple[int, int, int, int], rollout: RolloutSettings,
+    model: nn.Module, condition: Condition, shape: tuple[int, int, int, int], rollout: RolloutConfig,
     grpo: GrpoConfig, *, seed: int = 0, buffer_videos: int = 0,
 ) -> list[CheckResult]:
     """Sample a few videos of shape (C, F, H, W) and check them; the model's weights are as before afterwards.
@@ -92,14 +96,15 @@ def _report_not_finite(sampled: VideoRollout) -> CheckResult:
 
 
 def _check_ode(
-    model: nn.Module, condition: Condition, noise: Tensor, seeds: Tensor, rollout: RolloutSettings
+    model: nn.Module, condition: Condition, noise: Tensor, seeds: Tensor, rollout: RolloutConfig
 ) -> CheckResult:
     """Compare every step of the arm at eta = 0, and the ODE rollout, with plain Euler sums x + (s - t) v."""
-    quiet, given = replace(rollout.sampler, eta=0.0), condition.frames.float()
-    context = StepContext(given, float(rollout.times[1]))
+    quiet, given = rollout.sampler.with_values(eta=0.0), condition.frames.float()
+    at = flow_times(rollout.num_steps, rollout.shift)
+    context = StepContext(given, float(at[1]))
     x, error, spread = with_conditioning(noise.float(), given), 0.0, 0.0
     with torch.no_grad():
-        for t, s in pairwise(rollout.times):
+        for t, s in pairwise(at):
             times, ends = t.expand(len(x)), s.expand(len(x))
             v = guided_velocity(model, x, times, condition, rollout.cfg).float()
             law, euler = step(x, v, times, ends, context, quiet), with_conditioning(x + float(s - t) * v, given)
@@ -118,7 +123,7 @@ def _relative_error(actual: Tensor, expected: Tensor) -> float:
     return float((actual - expected).abs().max() / expected.abs().max())
 
 
-def _check_mask(sampled: VideoRollout, num_conditioning: int, rollout: RolloutSettings) -> CheckResult:
+def _check_mask(sampled: VideoRollout, num_conditioning: int, rollout: RolloutConfig) -> CheckResult:
     name = "the mask is not flat"
     if rollout.sampler.arm != "dyndiff":
         return CheckResult(name, True, f"arm {rollout.sampler.arm} has none", "")
@@ -140,32 +145,30 @@ def _check_round_trip(buffer: RolloutBuffer) -> CheckResult:
 
 def _measure_memory(learner: GrpoLearner, sampled: VideoRollout, videos: int) -> CheckResult:
     """Measure what each KL anchor keeps beside the weights, for a buffer of `videos` videos."""
-    weights = sum(p.nbytes for p in learner.parameters)
-    zeta, scale = sampled.zeta, videos / len(sampled.latents) / MIB
-    noise = "only seeds" if zeta is None else f"{zeta.nbytes * scale:.2f} MiB of noise"
+    weights, scale = sum(p.nbytes for p in learner.parameters), videos / len(sampled.latents) / MIB
     text = (
-        f"frozen, moving: {weights / MIB:.2f} MiB of weights that train; buffer: {noise} and "
-        f"{sampled.mask.nbytes * scale:.2f} MiB of masks for {videos} videos; dual: both; lora_off: nothing; chosen: "
-        f"{learner.settings.kl.anchor}"
+        f"frozen: {weights / MIB:.2f} MiB of weights that train; buffer: {sampled.zeta.nbytes * scale:.2f} MiB of "
+        f"noise and {sampled.mask.nbytes * scale:.2f} MiB of masks for {videos} videos; dual: both; lora_off: nothing; "
+        f"chosen: {learner.settings.kl.anchor}"
     )
     return CheckResult("memory of the KL anchors", True, text, "")
 
 
-def _limits(rollout: RolloutSettings) -> tuple[float, float]:
+def _limits(rollout: RolloutConfig) -> tuple[float, float]:
     """Return the limits of the ratio's distance from 1, and of the KL."""
     if rollout.noise_store == "zeta_bfloat16":
         return ROUNDED_RATIO_LIMIT, ROUNDED_KL_LIMIT
     return RATIO_LIMIT, KL_LIMIT
 
 
-def _without_updates(grpo: GrpoConfig, rollout: RolloutSettings) -> GrpoConfig:
+def _without_updates(grpo: GrpoConfig, rollout: RolloutConfig) -> GrpoConfig:
     """Settings of one update that changes no weight; a transition beyond the ratio's limit counts as clipped."""
     limit, _ = _limits(rollout)
     mode, anchor = "mean", grpo.kl.anchor
     if grpo.objective == "nft":
         mode, anchor = "velocity", "lora_off" if anchor == "lora_off" else "frozen"
     return grpo.with_values(
-        updates_per_buffer=1, learning_rate=0.0, weight_decay=0.0, ema_decay=0.0, ratio_norm=False,
+        updates_per_buffer=1, learning_rate=0.0, weight_decay=0.0, ema_decay=0.0,
         kl=grpo.kl.with_values(mode=mode, beta=1.0, anchor=anchor), clip_low=limit, clip_high=limit,
         advantage=load_video_config("base").grpo.advantage,
     )
@@ -188,7 +191,7 @@ def _check_first_update(learner: GrpoLearner, buffer: RolloutBuffer) -> tuple[Ch
     )
 
 
-def _make_buffer(sampled: VideoRollout, condition: Condition, rollout: RolloutSettings) -> RolloutBuffer:
+def _make_buffer(sampled: VideoRollout, condition: Condition, rollout: RolloutConfig) -> RolloutBuffer:
     count = len(sampled.latents)
     return RolloutBuffer(
         sampled, condition, torch.zeros(count, dtype=torch.int64), torch.arange(count), {},

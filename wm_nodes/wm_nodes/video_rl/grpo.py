@@ -11,14 +11,12 @@ Everything is computed where the model is; a buffer may lie there or in the host
 micro-batches.
 """
 
-import copy
 import json
 import math
 import time
-import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -27,22 +25,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 
-from wm_nodes.config.video import GrpoConfig
+from wm_nodes.config.video import GrpoConfig, RolloutConfig
 from wm_nodes.core.device import device_of, synchronize
 from wm_nodes.training import checkpoint
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import WeightsError, check_same_layout
 from wm_nodes.video_model.buffer import RolloutBuffer
-from wm_nodes.video_model.sampling import RolloutSettings
-from wm_nodes.video_rl.group_advantages import (
-    GroupAdvantages,
-    RunningStd,
-    best_of_n,
-    group_advantages,
-    mixed_advantages,
-    trainable,
-    win_rates,
-)
+from wm_nodes.video_rl.group_advantages import GroupAdvantages, best_of_n, group_advantages, trainable
 from wm_nodes.video_rl.nft import NftTerms
 from wm_nodes.video_rl.ratio_and_kl import GrpoTerms, Rows
 
@@ -53,46 +42,61 @@ MAX_SKIPPED = 5
 
 @dataclass(frozen=True)
 class UpdateReport:
-    """One optimizer step; see docs/metrics.md. clip_low_share, clip_high_share: of transitions, by tail.
+    """One optimizer step; see docs/metrics.md.
 
     With objective nft there is no ratio: it and the clips are NaN, as is the KL without an anchor.
-    *_seconds: forward of the weights that train; the anchor's forward and the KL; backward of both.
     """
 
     objective: float
+    """Mean of DD-16, or minus the loss of DD-31."""
     kl: float
+    """Mean of DD-17 or DD-20."""
     ratio_mean: float
+    """Mean of DD-15."""
     clip_low_share: float
+    """Transitions whose ratio is below the clip."""
     clip_high_share: float
+    """And above."""
     grad_norm: float
+    """Before it is clipped."""
     transitions: int
+    """(video, step) pairs."""
     forward_seconds: float
+    """Of the weights that train."""
     kl_seconds: float
+    """The anchor's forward and the KL."""
     backward_seconds: float
+    """Of both."""
 
 
 @dataclass(frozen=True)
 class BufferReport:
-    """The training on one buffer.
-
-    updates: one report per optimizer step, in order (index 0 is on-policy); none where the rewards differ in no group.
-    skipped: such buffers in a row, up to this one. dropped_groups: those with fewer valid videos than trainable() asks
-    for; they are in zero_std_ratio too. raw_rewards: mean of each score beside the total over the videos that have it,
-    NaN where none has. step_noise: noise_share of each stochastic sampler step.
-    """
+    """The training on one buffer."""
 
     updates: tuple[UpdateReport, ...]
+    """One per optimizer step, in order (index 0 is on-policy); none where the rewards differ in no group."""
     reward_mean: float
+    """Over the valid videos."""
     advantage_abs_mean: float
+    """Over the videos that train."""
     zero_std_ratio: float
+    """Share of groups without spread."""
     invalid: int
+    """Videos without a reward."""
     skipped: int
+    """Buffers without updates in a row, up to this one."""
     dropped_groups: int
+    """Those with fewer valid videos than trainable() asks for; they are in zero_std_ratio too."""
     kept: int
+    """Videos that train."""
     group_size: float
+    """Mean over the groups."""
     noise_share: float
+    """Noise budget that was spent, see VideoRollout.spent_noise."""
     raw_rewards: Mapping[str, float]
+    """Mean of each score beside the total over the videos that have it, NaN where none has."""
     step_noise: Mapping[int, float]
+    """noise_share of each stochastic sampler step."""
 
 
 class GrpoLearner:
@@ -100,31 +104,21 @@ class GrpoLearner:
 
     Args:
         seed: of the step selection (stream `step_selection`), and of noise and times (objective nft: stream `nft`).
-        reward_weights: of the buffer's raw rewards, for advantage.mix advantage; their `total` is then only reported.
         ranks: this process's place among the learner's processes; all hold the whole buffer.
     """
 
     def __init__(
-        self, model: nn.Module, settings: GrpoConfig, rollout: RolloutSettings, *, seed: int,
-        ranks: Ranks | None = None, reward_weights: Mapping[str, float] | None = None,
+        self, model: nn.Module, settings: GrpoConfig, rollout: RolloutConfig, *, seed: int, ranks: Ranks | None = None,
     ) -> None:
         if settings.objective == "ratio" and (rollout.sampler.arm == "ode" or rollout.sampler.eta == 0):
             raise ValueError(
                 "an ODE rollout has no likelihood to train on; choose a stochastic arm and eta > 0, or grpo.objective "
                 "nft"
             )
-        if settings.advantage.mix == "advantage" and settings.advantage.std_scope == "running":
-            raise ValueError("advantage.std_scope running is of one reward; with advantage.mix advantage take group")
-        if settings.mask_source == "recompute":
-            warnings.warn(
-                "grpo.mask_source recompute is an ablation: mask cells that flip throw the ratio out of its clip "
-                "range. Otherwise take cached",
-                stacklevel=2,
-            )
         if settings.trains == "condition":
             _train_condition(model)
         self.model, self.settings, self.rollout, self.seed = model, settings, rollout, seed
-        self.ranks, self.reward_weights = ranks or Ranks(), dict(reward_weights or {})
+        self.ranks = ranks or Ranks()
         self.version = 0
         """Optimizer steps made so far: the policy version of the weights."""
         self.skipped = 0
@@ -133,7 +127,6 @@ class GrpoLearner:
         self._optimizer = torch.optim.AdamW(
             self.parameters, lr=settings.learning_rate, weight_decay=settings.weight_decay
         )
-        self._running = RunningStd()
         self._terms = (NftTerms if settings.objective == "nft" else GrpoTerms)(model, settings, rollout, seed)
         self.averaged = self._terms.trained() if settings.ema_decay > 0 else {}
 
@@ -156,12 +149,13 @@ class GrpoLearner:
             )
         rewards, before = mixed_reward(buffer), self._snapshot()
         trains = torch.from_numpy(trainable(buffer.valid.numpy(), buffer.group_ids.numpy()))
-        advantages = self._advantages(rewards, buffer, trains)
+        settings = self.settings.advantage
+        advantages = group_advantages(
+            rewards, buffer.group_ids, trains, clip=settings.clip, std_scope=settings.std_scope
+        )
         invalid = int((~buffer.valid).sum())
         dropped = advantages.num_groups - len(set(buffer.group_ids[trains].tolist()))
-        kept = best_of_n(
-            advantages.advantages_N, buffer.group_ids, advantages.kept_N, self.settings.advantage.best_of_n
-        )
+        kept = best_of_n(advantages.advantages_N, buffer.group_ids, advantages.kept_N, settings.best_of_n)
         skipped = 0 if bool(kept.any()) else self.skipped + 1
         if not bool(trains.any()) or skipped >= MAX_SKIPPED:
             raise ValueError(
@@ -170,7 +164,9 @@ class GrpoLearner:
                 f"spread; {self.skipped} buffers before it were skipped; look at the reward"
             )
         try:
-            updates = tuple(self._update(buffer, rows, advantages) for rows in self._passes(buffer, kept))
+            rows = self.rows(buffer, kept)
+            steps = self.settings.updates_per_buffer if len(rows) else 0
+            updates = tuple(self._update(buffer, rows, advantages) for _ in range(steps))
             if updates:
                 self._terms.move_old(self.version)
         except BaseException:
@@ -195,19 +191,20 @@ class GrpoLearner:
             step_noise=dict(zip(buffer.rollout.steps, buffer.rollout.noise_share.tolist(), strict=True)),
         )
 
-    def gradients(self, buffer: RolloutBuffer, rows: "Rows", advantages: GroupAdvantages) -> dict[str, float]:
+    def rows(self, buffer: RolloutBuffer, kept_N: Tensor) -> Rows:
+        """Return what every update on the buffer trains on: the chosen steps of the kept videos."""
+        return Rows(*torch.nonzero(self._terms.choose(buffer) & kept_N.unsqueeze(1), as_tuple=True))
+
+    def gradients(self, buffer: RolloutBuffer, rows: Rows, advantages: GroupAdvantages) -> dict[str, float]:
         """Accumulate the gradient of L = -J + beta KL over the rows into .grad; return the sums for a report."""
         device, total, seconds = device_of(self.model), len(rows), [0.0, 0.0, 0.0]
         sums = torch.zeros(5, dtype=torch.float64, device=device)
         signals = advantages.advantages_N.to(device, torch.float32)
-        weights = self._terms.step_weights(buffer, rows)
         own = self.ranks.share(torch.arange(total))
         for index in torch.split(own, self.settings.micro_batch):  # type: ignore[no-untyped-call]
             clock, part = [self._now(device)], rows.part(index)
             current: Any = self._terms.objective(buffer, part, signals[part.videos.to(device)], self.version)
             objective = current.objective
-            if weights is not None:
-                objective = objective * weights[part.positions].to(device)
             clock.append(self._now(device))
             kl = self._terms.kl(current, buffer, part, self.version)
             clock.append(self._now(device))
@@ -228,39 +225,12 @@ class GrpoLearner:
 
     # internals
 
-    def _advantages(self, rewards: Tensor, buffer: RolloutBuffer, trains: Tensor) -> GroupAdvantages:
-        """trains: bool (N,), the videos that may be compared; see reward.agent.contract."""
-        settings = self.settings.advantage
-
-        def signal(values: Tensor) -> Tensor:
-            return win_rates(values, buffer.group_ids, trains) if settings.source == "win_rate" else values
-
-        shared: dict[str, Any] = {name: getattr(settings, name) for name in ("clip", "std_scope", "ddof", "floor")}
-        if settings.mix == "advantage":
-            values = {name: signal(value) for name, value in buffer.rewards.items()}
-            return mixed_advantages(values, self.reward_weights, buffer.group_ids, trains, **shared)
-        running = self._running if settings.std_scope == "running" else None
-        return group_advantages(signal(rewards), buffer.group_ids, trains, **shared, running=running)
-
     @staticmethod
     def _now(device: torch.device) -> float:
         synchronize(device)
         return time.perf_counter()
 
-    def _passes(self, buffer: RolloutBuffer, kept: Tensor) -> Iterator[Rows]:
-        chosen = self._terms.choose(buffer) & kept.unsqueeze(1)
-        count = self.settings.updates_per_buffer
-        for update in range(count):
-            rows = chosen
-            if self.settings.passes == "parts":
-                rows = chosen & (torch.arange(len(buffer)) % count == update).unsqueeze(1)
-            videos, positions = torch.nonzero(rows, as_tuple=True)
-            if len(videos):
-                yield Rows(videos, positions)
-
     def _update(self, buffer: RolloutBuffer, rows: Rows, advantages: GroupAdvantages) -> UpdateReport:
-        if self.settings.kl.anchor == "moving" and self.version % self.settings.kl.moving_updates == 0:
-            self._terms.move_anchor()
         self.model.train()
         self._optimizer.zero_grad(set_to_none=True)
         sums = self.gradients(buffer, rows, advantages)
@@ -291,8 +261,7 @@ class GrpoLearner:
             "model": self._terms.trained(),
             "optimizer": {k: v.detach().clone() for k, v in checkpoint.optimizer_tensors(self._optimizer).items()},
             "averaged": {name: value.clone() for name, value in self.averaged.items()},
-            "anchor": self._terms.anchor, "old": self._terms.old,  # replaced, never changed
-            "running": copy.copy(self._running),
+            "old": self._terms.old,  # replaced, never changed
             "version": self.version,
         }
 
@@ -301,8 +270,7 @@ class GrpoLearner:
         checkpoint.restore_optimizer(self._optimizer, before["optimizer"])
         for name, value in before["averaged"].items():
             self.averaged[name].copy_(value)
-        self._terms.anchor, self._terms.old = before["anchor"], before["old"]
-        self.version, self._running = before["version"], before["running"]
+        self._terms.old, self.version = before["old"], before["version"]
 
     # checkpoints
 
@@ -314,7 +282,6 @@ class GrpoLearner:
             "old": self._terms.old, "optimizer": checkpoint.optimizer_tensors(self._optimizer),
         }
         header = {"version": self.version, "seed": self.seed, "iteration": iteration, "skipped": self.skipped}
-        header |= {f.name: getattr(self._running, f.name) for f in fields(self._running)}
         checkpoint.write_checkpoint(path, sections, {"grpo": json.dumps(header)})
 
     def load(self, path: Path) -> int:
@@ -345,8 +312,7 @@ class GrpoLearner:
             {name: value.to(device) for name, value in checkpoint.section(tensors, prefix).items()} for prefix in own
         )
         checkpoint.restore_optimizer(self._optimizer, checkpoint.section(tensors, "optimizer."))
-        self._running = RunningStd(header["sum_of_squares"], header["count"])
-        self.version, self.skipped = header["version"], header.get("skipped", 0)  # older files have skipped none
+        self.version, self.skipped = header["version"], header["skipped"]
         return int(header["iteration"])
 
 

@@ -1,5 +1,5 @@
 """Probability ratios, objective and KL of GRPO over Gaussian sampler steps. DD-12, DD-14 to
-DD-17a, DD-27.
+DD-17a.
 
 Shapes: M transitions, each a (video, step) pair; U generated elements of one latent video. A transition is stored as
 its normalised noise zeta = (x_s - mean) / std, taken after x_s was rounded to its storage type; with std cached, every
@@ -11,7 +11,6 @@ so both are exactly 0 while the weights have not moved, and free of the cancella
 """
 
 import math
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -31,13 +30,6 @@ def log_ratio(new_zeta_MU: Tensor, old_zeta_MU: Tensor, weight_MU: Tensor | floa
     return (0.5 * weight_MU * (old_zeta_MU - new_zeta_MU) * (old_zeta_MU + new_zeta_MU)).mean(1)
 
 
-def normalised_log_ratio(new_zeta_MU: Tensor, old_zeta_MU: Tensor, std_MU: Tensor) -> Tensor:
-    """Return the log of DD-15b, (M,): rms(std) (log ratio + mean (delta / std)^2 / 2), centred at 0 for small moves."""
-    drift = (old_zeta_MU - new_zeta_MU).square().mean(1) / 2
-    rms = std_MU.expand_as(new_zeta_MU).square().mean(1).sqrt()
-    return rms * (log_ratio(new_zeta_MU, old_zeta_MU) + drift)
-
-
 def clipped_objective(log_ratio_M: Tensor, advantages_M: Tensor, *, clip_low: float, clip_high: float) -> Tensor:
     """Return DD-16 per transition, to be maximised: min(r A, clamp(r, 1 - clip_low, 1 + clip_high) A)."""
     ratio = log_ratio_M.exp()
@@ -55,18 +47,11 @@ def mean_kl(new_zeta_MU: Tensor, target_zeta_MU: Tensor) -> Tensor:
     return 0.5 * (target_zeta_MU - new_zeta_MU).square().mean(1)
 
 
-def log_space_kl(log_ratio_M: Tensor, mode: Literal["logk2", "logk3"]) -> Tensor:
-    """Return the k2 estimate (log r)^2 / 2 or the k3 estimate r^-1 - 1 + log r, (M,); DD-17a; far weaker than DD-17."""
-    if mode == "logk2":
-        return 0.5 * log_ratio_M.square()
-    return torch.expm1(-log_ratio_M) + log_ratio_M
+def log_space_kl(log_ratio_M: Tensor) -> Tensor:
+    """Return the k2 estimate (log r)^2 / 2, (M,); DD-17a; far weaker than DD-17."""
+    return 0.5 * log_ratio_M.square()
 
 
 def velocity_kl(new_zeta_MU: Tensor, target_zeta_MU: Tensor, std_MU: Tensor, slope_MU: Tensor) -> Tensor:
     """Return mean over elements of (v_new - v_target)^2 (DD-17a), (M,), from delta mean = slope delta v."""
     return (std_MU * (target_zeta_MU - new_zeta_MU) / slope_MU).square().mean(1)
-
-
-def step_equaliser(sensitivity_S: Tensor) -> Tensor:
-    """Return the weight median_j g_j / g_k of each step (SAGE, DD-27), from g = rms_u |d mean / d v| / std, (S,)."""
-    return sensitivity_S.median() / sensitivity_S

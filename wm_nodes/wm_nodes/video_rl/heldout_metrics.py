@@ -1,4 +1,4 @@
-"""Metrics of clips that are never trained on. Shapes: N clips, F frames, H W 3 image, P positions (PROBE_NAMES)."""
+"""Metrics of clips that are never trained on. Shapes: N clips, F frames, H W 3 image, P positions."""
 
 import json
 from collections.abc import Callable
@@ -11,22 +11,23 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.tasks import get_task
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import FloatArray
-from wm_nodes.environments.maniskill.replay import execute_paths
+from wm_nodes.environments.cameras import ROBOT_BASE, still_cameras
+from wm_nodes.environments.replay import execute_paths
 from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_model.success_reader import SuccessReader
 from wm_nodes.video_model.tokenizer_codec import Codec
-from wm_nodes.video_rl.clip_faults import FaultLimits, find_faults, measure_fault_limits
+from wm_nodes.video_rl.clip_faults import FaultLimits, FilmedScene, find_faults, measure_fault_limits
 from wm_nodes.video_rl.reference_reward import score_clips
 from wm_nodes.video_rl.sampling import ClipGenerator
 from wm_nodes.video_rl.validation import evaluated_contexts
 from wm_nodes.world_model.position_probe import PositionProbe
-from wm_nodes.world_model.training.tokenizer import probe_targets
-from wm_nodes.world_model.validation.open_loop import OBJECT, TOOL
+from wm_nodes.world_model.positions import columns_of, probe_targets
 
 UNREWARDED = (
     "executed_success", "executed_object_cm", "reader_success", "object_permanence", "impossible_tool_steps",
@@ -42,40 +43,54 @@ SAME_SCENE = 2e-3
 
 @dataclass(frozen=True)
 class Yardstick:
-    """What decoded clips are measured with.
-
-    probe: reads positions. reader: reads success, and is another one; None: there is none. simulation: of the
-    recordings. limits: of what is possible. correction: of fit_tool_correction. The last two are of recordings that
-    went through the codec.
-    """
+    """What decoded clips are measured with."""
 
     probe: PositionProbe
+    """Reads positions."""
     reader: SuccessReader | None
+    """Reads success, and is another one; None: there is none."""
     simulation: SimulationConfig
+    """Of the recordings."""
+    scene: FilmedScene
+    """Of the recordings."""
     limits: FaultLimits
+    """Of what is possible, by recordings that went through the codec."""
     correction: NDArray[np.float64]
+    """Of fit_tool_correction, by recordings that went through the codec."""
 
 
 def make_yardstick(
     codec: Codec, recordings: Clips, probe: PositionProbe, reader: SuccessReader | None, simulation: SimulationConfig
 ) -> Yardstick:
-    """Measure limits and correction on recordings."""
+    """Measure limits and correction on recordings. Raises ValueError: no camera stands still, or no state is known."""
+    scene = filmed_scene(recordings.task, simulation, recordings.frames.shape[2])
     decoded = codec.decode(codec.encode(recordings.frames))
     seen = probe.read(decoded)
     return Yardstick(
-        probe, reader, simulation, measure_fault_limits(decoded, seen, simulation),
-        fit_tool_correction(seen, probe_targets(recordings.ground_truth, recordings.task)),
+        probe, reader, simulation, scene, measure_fault_limits(decoded, seen, scene),
+        fit_tool_correction(
+            seen[..., scene.tool], probe_targets(recordings.ground_truth, recordings.task)[..., scene.tool]
+        ),
     )
+
+
+def filmed_scene(task: str, simulation: SimulationConfig, size: int) -> FilmedScene:
+    """What pictures `size` px high show of a task in its simulator. Raises ValueError as still_cameras."""
+    thing, tool = (columns_of(task, name) for name in ("object", "tool"))
+    height = get_task(task).judge.object_height_m
+    return FilmedScene(still_cameras(simulation, size), ROBOT_BASE, height, thing, tool)
 
 
 @dataclass(frozen=True)
 class Unrewarded:
-    """before, after: of UNREWARDED by name, a value per context; executed ones of the first contexts alone. missing: by
-    name why one is not measured."""
+    """What no reward knows, of two models."""
 
     before: dict[str, list[float]]
+    """Of UNREWARDED by name, a value per context; executed ones of the first contexts alone."""
     after: dict[str, list[float]]
+    """The same of the trained model."""
     missing: dict[str, str]
+    """By name why one is not measured."""
 
 
 def load_or_measure_unrewarded(
@@ -131,7 +146,7 @@ def measure_clips(
     positions: what the probe reads in the clips, (N, F, P).
     """
     scores = score_clips(frames, references, by.probe, num_conditioning).named()
-    faults = find_faults(frames, positions, by.limits, by.simulation, num_conditioning).named()
+    faults = find_faults(frames, positions, by.limits, by.scene, num_conditioning).named()
     if by.reader is None:
         return {**scores, **faults}
     probability = by.reader.read(frames[:, -1])
@@ -141,12 +156,12 @@ def measure_clips(
 
 def fit_tool_correction(positions: FloatArray, truth: FloatArray) -> NDArray[np.float64]:
     """Return the least-squares map (4, 3) from tool positions that the probe reads in decoded recordings to the true
-    ones, both (N, F, P), with an offset in the last row. Raises ValueError where no true one is known.
+    ones, both (N, F, 3), with an offset in the last row. Raises ValueError where no true one is known.
 
-    A codec may make the tool look lower than it is: that of the shipped push_cube does, by 1.1 cm on average and by
+    A codec may make the tool look lower than it is: a shipped one does, by 1.1 cm on average and by
     2.3 cm at heights above 12 cm. Uncorrected, paths that pass over the object touch it when they are executed.
     """
-    seen, wanted = (values[..., TOOL].reshape(-1, 3).astype(np.float64) for values in (positions, truth))
+    seen, wanted = (values.reshape(-1, 3).astype(np.float64) for values in (positions, truth))
     known = np.isfinite(wanted).all(1)
     if not known.any():
         raise ValueError("the recordings have no simulator state")
@@ -166,9 +181,9 @@ def measure_executability(
     Raises:
         ValueError: as execute_paths; the scene of a reset seed is not the recording's.
     """
-    paths = (positions[..., TOOL] @ by.correction[:3] + by.correction[3]).astype(np.float32)
+    paths = (positions[..., by.scene.tool] @ by.correction[:3] + by.correction[3]).astype(np.float32)
     executed = execute_paths(
-        references.task, by.simulation, references.seeds, paths, positions[:, -1, OBJECT], stride,
+        references.task, by.simulation, references.seeds, paths, positions[:, -1, by.scene.thing], stride,
         num_workers=num_workers,
     )
     recorded = references.ground_truth[:, 0]

@@ -16,14 +16,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from wm_nodes.config.video import GrpoConfig
+from wm_nodes.config.video import GrpoConfig, RolloutConfig
 from wm_nodes.core.device import device_of
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.video_model.buffer import RolloutBuffer
 from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.kernels import with_conditioning
 from wm_nodes.video_model.network import guided_velocity
-from wm_nodes.video_model.sampling import RolloutSettings
 from wm_nodes.video_rl.ratio_and_kl import Anchored, Rows
 
 LEAST_ERROR = 1e-5
@@ -31,20 +30,24 @@ LEAST_ERROR = 1e-5
 
 
 class ForwardPass(NamedTuple):
-    """One pass of the current weights at x_t. objective: (M,), with gradient. v: (M, U), with gradient. x_t, t,
-    condition: what the network was asked, for the anchor."""
+    """One pass of the current weights at x_t."""
 
     objective: Tensor
+    """(M,), with gradient."""
     v: Tensor
+    """(M, U), with gradient."""
     x_t: Tensor
+    """The noised clips; with t and condition what the network was asked, for the anchor."""
     t: Tensor
+    """float64 (M,)."""
     condition: Condition
+    """Of every row."""
 
 
 class NftTerms(Anchored):
     """Objective and KL of noised clips under `model`."""
 
-    def __init__(self, model: nn.Module, settings: GrpoConfig, rollout: RolloutSettings, seed: int) -> None:
+    def __init__(self, model: nn.Module, settings: GrpoConfig, rollout: RolloutConfig, seed: int) -> None:
         super().__init__(model, settings, rollout, seed)
         self.old = self.trained()
 
@@ -78,7 +81,7 @@ class NftTerms(Anchored):
         nft, clip, share = self.settings.nft, self.settings.advantage.clip, share.flatten(1)
         change = nft.beta * (v - old)  # exactly 0 while the weights have not moved
         errors = (noisy - share * (old + sign * change) - clean for sign in (1, -1))
-        good, bad = (squared_error(error, adaptive=nft.adaptive) for error in errors)
+        good, bad = (adaptive_error(error) for error in errors)
         share_good = (signals_M / (2 * clip) + 0.5).clamp(0, 1)
         loss = clip * (share_good * good + (1 - share_good) * bad) / nft.beta
         return ForwardPass(-loss, v, x_t, t, condition)
@@ -97,9 +100,6 @@ class NftTerms(Anchored):
         if self._has_kl:
             missing[0] = kl.detach().sum()
         return missing
-
-    def step_weights(self, buffer: RolloutBuffer, rows: Rows) -> None:
-        """There are no steps to weigh."""
 
     # internals
 
@@ -127,7 +127,6 @@ class NftTerms(Anchored):
         return shift * r / (1 + (shift - 1) * r), noise
 
 
-def squared_error(error_MU: Tensor, *, adaptive: bool) -> Tensor:
-    """Return each row's mean squared error, (M,); adaptive: divided by its mean absolute error, without gradient."""
-    square = error_MU.square().mean(1)
-    return square / error_MU.detach().abs().mean(1).clamp_min(LEAST_ERROR) if adaptive else square
+def adaptive_error(error_MU: Tensor) -> Tensor:
+    """Return each row's mean squared error over its mean absolute error, (M,); no gradient through the divisor."""
+    return error_MU.square().mean(1) / error_MU.detach().abs().mean(1).clamp_min(LEAST_ERROR)

@@ -17,20 +17,16 @@ from torch import Tensor
 
 from wm_nodes.config.tasks import get_task
 from wm_nodes.core.types import FloatArray
-from wm_nodes.environments.maniskill.table_top import CUBE_HALF_SIZE_M
 from wm_nodes.reward.picture_similarity import psnr_db, ssim
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.tokenizer_codec import Codec
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.position_probe import PositionProbe
-from wm_nodes.world_model.tokenizer import PROBE_NAMES
-from wm_nodes.world_model.training.tokenizer import probe_targets
-from wm_nodes.world_model.validation.open_loop import OBJECT, TOOL
+from wm_nodes.world_model.positions import columns_of, probe_targets
 
 TRACKING_SCALE_M, OUTCOME_SCALE_M = 0.03, 0.05
 """An error of this much takes the tracking score, or the outcome, to 1 / e."""
-GOAL = [PROBE_NAMES.index(name) for name in ("goal_x", "goal_y")]
 SEEN_MOTION = 12
 """A pixel counts as scenery while no recorded frame differs from the first one by more than this, of 255."""
 ERRORS = (
@@ -45,22 +41,25 @@ FULL_PSNR_DB = 40.0
 
 @dataclass(frozen=True)
 class ClipScores:
-    """Per clip, float64 (N,), in the host's memory. tracking: mean exp(-error / 3 cm) of object and tool over generated
-    frames, in (0, 1]. scenery: mean absolute error, [0, 1], where the recording stands still. psnr_db: of generated
-    frames. object_cm, tool_cm: mean position errors. motion: object path length, share of the recorded one, at most 2;
-    1 where the recorded object stands still. success: 1 where the task is done in the last frame. outcome:
-    exp(-d / 5 cm), d what is then left to the edge of the goal (DD-32). All but scenery and psnr_db are NaN where the
-    recording has no simulator state.
-    """
+    """Per clip, float64 (N,), in the host's memory. All but scenery and psnr_db are NaN where the recording has no
+    simulator state."""
 
     tracking: Tensor
+    """Mean exp(-error / 3 cm) of object and tool over generated frames, in (0, 1]."""
     scenery: Tensor
+    """Mean absolute error, [0, 1], where the recording stands still."""
     psnr_db: Tensor
+    """Of generated frames."""
     object_cm: Tensor
+    """Mean position error of the object."""
     tool_cm: Tensor
+    """Mean position error of the tool."""
     motion: Tensor
+    """Object path length, share of the recorded one, at most 2; 1 where the recorded object stands still."""
     success: Tensor
+    """1 where the task is done in the last frame."""
     outcome: Tensor
+    """exp(-d / 5 cm), d what is then left to the edge of the goal (DD-32)."""
 
     def named(self) -> dict[str, Tensor]:
         return dict(vars(self))
@@ -88,8 +87,8 @@ def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_con
     truth = probe_targets(references.ground_truth[:, generated], references.task)
     unknown = bool(np.isnan(truth).all())  # then the pictures may be of cameras that the probe does not know
     positions = truth if unknown else probe.read(frames[:, generated])
-    object_m = np.linalg.norm(positions[..., OBJECT] - truth[..., OBJECT], axis=-1)
-    tool_m = np.linalg.norm(positions[..., TOOL] - truth[..., TOOL], axis=-1)
+    thing, tool = (columns_of(references.task, name) for name in ("object", "tool"))
+    object_m, tool_m = (np.linalg.norm((positions - truth)[..., columns], axis=-1) for columns in (thing, tool))
     tracking = (np.exp(-object_m / TRACKING_SCALE_M) + np.exp(-tool_m / TRACKING_SCALE_M)) / 2
     error = (frames[:, generated].float() - recorded[:, generated].float()) / 255
     changed = (recorded.int() - recorded[:, :1].int()).abs().amax((1, 4)) > SEEN_MOTION
@@ -102,7 +101,7 @@ def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_con
         psnr_db=(-10 * error.square().mean((1, 2, 3, 4)).clamp_min(1e-8).log10()).double().cpu(),
         object_cm=torch.from_numpy(100 * object_m.mean(1)).double(),
         tool_cm=torch.from_numpy(100 * tool_m.mean(1)).double(),
-        motion=torch.from_numpy(_path_share(positions[..., OBJECT], truth[..., OBJECT])).double(),
+        motion=torch.from_numpy(_path_share(positions[..., thing], truth[..., thing])).double(),
         success=torch.from_numpy(np.where(np.isfinite(left_m), left_m <= 0, left_m)).double(),
         outcome=torch.from_numpy(np.exp(-np.maximum(left_m, 0) / OUTCOME_SCALE_M)).double(),
     )
@@ -134,18 +133,19 @@ def distance_left(positions: FloatArray, truth: FloatArray, task: str) -> FloatA
     without a goal.
 
     Args:
-        positions: read off a frame, (N, P) of PROBE_NAMES. truth: of the scene that the goal is in, the same.
+        positions: read off a frame, (N, P). truth: of the scene that the goal is in, the same.
     """
-    rule = get_task(task).goal
+    part, (thing, tool, goal) = get_task(task).judge, (columns_of(task, name) for name in ("object", "tool", "goal"))
+    rule = part.goal
     if rule is None:
         return np.full(len(positions), np.nan, np.float32)
     if rule.above_thing_m is None:
-        place, goal = positions[:, OBJECT if rule.mover == "object" else TOOL[:2]], truth[:, GOAL]
+        place, target = positions[:, thing if rule.mover == "object" else tool[:2]], truth[:, goal]
     else:
         # the probe does not read how high the thing lies
-        height = np.full((len(truth), 1), CUBE_HALF_SIZE_M + rule.above_thing_m, np.float32)
-        place, goal = positions[:, TOOL], np.concatenate([truth[:, OBJECT], height], 1)
-    left: FloatArray = np.linalg.norm(place - goal, axis=-1) - rule.radius_m
+        height = np.full((len(truth), 1), part.object_height_m + rule.above_thing_m, np.float32)
+        place, target = positions[:, tool], np.concatenate([truth[:, thing], height], 1)
+    left: FloatArray = np.linalg.norm(place - target, axis=-1) - rule.radius_m
     return left
 
 

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from pydantic import TypeAdapter
 from torch import Tensor, nn
 
 from wm_nodes.config.video import RolloutConfig, VideoRlConfig
@@ -13,7 +12,6 @@ from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.video_model import (
     Condition,
     RolloutBuffer,
-    RolloutSettings,
     config_hash,
     initial_noise,
     sample_videos,
@@ -25,26 +23,24 @@ from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_rl.reference_reward import all_scores, attach_rewards, mix_rewards
 from wm_nodes.world_model.position_probe import PositionProbe
 
-_ROLLOUT = TypeAdapter(RolloutSettings)
-
-
-def rollout_settings(config: RolloutConfig) -> RolloutSettings:
-    """Return the settings that the sampler is called with."""
-    return _ROLLOUT.validate_python(config.model_dump())
-
 
 @dataclass(frozen=True)
 class GroupRequest:
-    """What to sample. contexts: rows of the generator's clips. iteration, policy_version: of the learner. history:
-    clips that the model makes one after the other before those of a group, which share them; None: the group's are of
-    whole recordings."""
+    """What to sample."""
 
     contexts: tuple[int, ...]
+    """Rows of the generator's clips."""
     group_size: int
+    """Clips of each context."""
     iteration: int
+    """Of the learner."""
     policy_version: int
+    """Of the weights that sample."""
     shared_noise: bool = False
+    """One initial noise for all clips of a context."""
     history: int | None = None
+    """Clips that the model makes one after the other before those of a group, which share them; None: the group's are
+    of whole recordings."""
 
 
 def drawn_history(config: VideoRlConfig, iteration: int) -> int | None:
@@ -77,7 +73,7 @@ def sample_buffer(
     Noise and condition are moved to the network. seeds: of each video's step noise. groups, samples: int64 (N,), see
     RolloutBuffer.
     """
-    settings = rollout_settings(config.rollout)
+    settings = config.rollout
     steps = stochastic_steps(settings.num_steps, config.window, iteration, config.seed)
     device = device_of(network)
     condition = condition.to(device)
@@ -193,8 +189,8 @@ class ClipGenerator:
         codec = self.folder.codec
         return codec.channels, frames, H // codec.patch, W // codec.patch
 
-    def _ode(self, num_steps: int) -> RolloutSettings:
-        return RolloutSettings(num_steps, self.config.rollout.shift, self.config.rollout.cfg)
+    def _ode(self, num_steps: int) -> RolloutConfig:
+        return self.config.rollout.with_values(num_steps=num_steps, buffer_device="model")
 
     def _made(self, history: int) -> int:
         """Frames of so many clips, the recorded first ones among them."""

@@ -27,7 +27,7 @@ from wm_nodes.video_model import (
     sample_videos,
 )
 from wm_nodes.video_rl.reference_reward import attach_rewards
-from wm_nodes.video_rl.sampling import rollout_settings, sample_buffer
+from wm_nodes.video_rl.sampling import sample_buffer
 
 CHANNELS, FRAMES, SIDE = 2, 6, 16
 NUM_ACTIONS = 4
@@ -49,12 +49,16 @@ CHANGE = 0.02
 
 @dataclass(frozen=True)
 class Scenes:
-    """background: (B, C, H, W), H = W. start: (B, 2) row, column. speed: (B,) pixels per frame. action: int64 (B,)."""
+    """Scenes of one size."""
 
     background: Tensor
+    """(B, C, H, W), H = W."""
     start: Tensor
+    """(B, 2) row, column."""
     speed: Tensor
+    """(B,) pixels per frame."""
     action: Tensor
+    """int64 (B,)."""
 
     def __len__(self) -> int:
         return len(self.action)
@@ -94,16 +98,18 @@ class Scenes:
 
 @dataclass(frozen=True)
 class Scores:
-    """Per video, float64 (B,). task: mean exp(-path error / 2), in (0, 1]. mass: opacity kept, 1 is all of it.
-    background: mean square error away from the disc. obeyed: 1 where the disc went more than MOVED_CELLS the
-    commanded way. consistency: exp(-change from frame to frame / CHANGE), 1 for a picture that stands still.
-    """
+    """Per video, float64 (B,)."""
 
     task: Tensor
+    """Mean exp(-path error / 2), in (0, 1]."""
     mass: Tensor
+    """Opacity kept, 1 is all of it."""
     background: Tensor
+    """Mean square error away from the disc."""
     obeyed: Tensor
+    """1 where the disc went more than MOVED_CELLS the commanded way."""
     consistency: Tensor
+    """exp(-change from frame to frame / CHANGE), 1 for a picture that stands still."""
 
     @property
     def reward(self) -> Tensor:
@@ -165,11 +171,14 @@ def score(videos: Tensor, scenes: Scenes) -> Scores:
 
 @dataclass(frozen=True)
 class SceneRequest:
-    """What to sample: a group of videos of each scene. iteration, policy_version: of the learner."""
+    """What to sample: a group of videos of each scene."""
 
     scenes: Scenes
+    """Of the iteration."""
     iteration: int
+    """Of the learner."""
     policy_version: int
+    """Of the weights that sample."""
 
 
 class ToyContexts:
@@ -212,7 +221,7 @@ class ToyContexts:
 
     def evaluate(self, scenes: Scenes) -> Scores:
         """Score one video of each scene, sampled by ODE."""
-        seeds, settings = self._seeds("evaluation", 0, torch.arange(len(scenes))), rollout_settings(self.config.rollout)
+        seeds, settings = self._seeds("evaluation", 0, torch.arange(len(scenes))), self.config.rollout
         self.network.eval()
         noise = self._noise(scenes, seeds)
         device = device_of(self.network)

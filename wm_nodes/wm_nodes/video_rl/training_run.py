@@ -25,7 +25,6 @@ from wm_nodes.training.weights import PackedWeights, save_weights
 from wm_nodes.video_model import RolloutBuffer, VideoNetwork
 from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner
 from wm_nodes.video_rl.reward_hacking import HackedMetric
-from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.video_rl.validation import SECTION, HeldoutScores, alarm_scalars, find_hacked_now
 
 CHECKPOINT = "checkpoints/video_learner.safetensors"
@@ -72,8 +71,7 @@ class VideoRun(TrainingRun):
         self.network, self.config, self._heldout = network, config, heldout
         self._training = threading.Lock()
         self.learner = GrpoLearner(
-            network, config.grpo, rollout_settings(config.rollout), seed=config.seed, ranks=ranks,
-            reward_weights=config.rewards,
+            network, config.grpo, config.rollout, seed=config.seed, ranks=ranks
         )
         self.iterations = 0
         """Buffers trained on in the run folder."""
@@ -85,6 +83,9 @@ class VideoRun(TrainingRun):
         self.staleness = 0
         """Optimizer steps between sampling and training of the last buffer."""
         self._metrics = MetricsWriter(run_dir, tensorboard=tensorboard) if self.ranks.rank == 0 else None
+        self.check: Callable[[], None] = lambda: None
+        """Called before every call of the network; what it raises ends the training with nothing changed. With several
+        ranks it is not called: one that stopped would leave the others waiting."""
         self.hacked: list[HackedMetric] = []
         """Metrics that the newest held-out evaluation finds hacked (DD-2)."""
 
@@ -106,12 +107,8 @@ class VideoRun(TrainingRun):
         """The version that samples the next buffer, number `iterations`."""
         return self.previous_version if self.prefetches else self.version
 
-    def train(self, buffer: RolloutBuffer, check: Callable[[], None] = lambda: None) -> BufferReport:
+    def train(self, buffer: RolloutBuffer) -> BufferReport:
         """Train on one buffer with rewards, or skip it (see GrpoLearner.train), then save.
-
-        Args:
-            check: called before every call of the network; what it raises ends the training with nothing changed. With
-                several ranks it is not called: one that stopped would leave the others waiting.
 
         Raises:
             As GrpoLearner.train; or OSError where saving fails: the training was then made; ensure_saved() tries again.
@@ -120,7 +117,7 @@ class VideoRun(TrainingRun):
             if self.ranks.size > 1 and self.ranks.rank == 0:
                 broadcast_bytes(buffer.to_bytes(), self.ranks)
             before, self.staleness = self.version, self.version - buffer.policy_version
-            stops = self.network.register_forward_pre_hook(lambda *_: check() if self.ranks.size == 1 else None)
+            stops = self.network.register_forward_pre_hook(lambda *_: self.check() if self.ranks.size == 1 else None)
             device, micro_batch = device_of(self.network), self.config.grpo.micro_batch
             with stops, explain_memory(device, grpo__micro_batch=micro_batch):
                 if self.config.rollout.buffer_device == "model":

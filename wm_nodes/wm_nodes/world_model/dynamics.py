@@ -1,7 +1,7 @@
 """The next-frame model over continuous latents (RS-1): (x_t+1, d_t+1) from frames 0..t and a condition.
 
 Shapes: B batch, T frames, S tokens per frame, D values per token, N condition tokens, K done heads, J tasks,
-A action, P state, Q probed positions (PROBE_NAMES).
+A action, P state, Q probed positions.
 
 Economy: the trunk reads frame t and its condition once, and from the same features come frame t + 1 (as a residual on
 frame t), the positions of its objects, and the done signal of frame t + 1. A terminal frame therefore costs no extra
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from wm_nodes.config.schema import WorldModelConfig
 from wm_nodes.world_model.conditions import ActionCondition
 from wm_nodes.world_model.state_change import StateChange
-from wm_nodes.world_model.tokenizer import PROBE_NAMES, normalise_tokens
+from wm_nodes.world_model.tokenizer import NUM_POSITIONS, normalise_tokens
 from wm_nodes.world_model.transformer import RingCache, SpatioTemporalTransformer, TemporalCache
 
 Caches = list[TemporalCache] | list[RingCache]
@@ -132,7 +132,7 @@ class ActionModel(FrameModel):
 
     def __init__(
         self, config: WorldModelConfig, *, num_tokens: int, latent_dim: int, action_dim: int, state_dim: int,
-        num_tasks: int, num_positions: int = len(PROBE_NAMES), measured: tuple[int, ...] = (),
+        num_tasks: int, num_positions: int = NUM_POSITIONS, measured: tuple[int, ...] = (),
     ) -> None:
         super().__init__(config, num_tokens, latent_dim, num_tasks, num_positions)
         self.condition = ActionCondition(action_dim, state_dim, config.width)

@@ -23,10 +23,11 @@ from wm_nodes.core.specs import EnvironmentSpec, spec_of_values, spec_values, to
 from wm_nodes.training.weights import WeightsError, check_same_layout
 from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.position_probe import PositionProbe
+from wm_nodes.world_model.positions import num_positions_of
 from wm_nodes.world_model.sentence_encoder import SentenceCondition
 from wm_nodes.world_model.text import TextModel
 from wm_nodes.world_model.token_dynamics import TokenActionModel
-from wm_nodes.world_model.tokenizer import PROBE_NAMES, Tokenizer
+from wm_nodes.world_model.tokenizer import Tokenizer
 
 FILES = {
     "tokenizer": "tokenizer.safetensors",
@@ -145,7 +146,7 @@ def load_model_folder(
         _check_encoder(folder, text, manifest)
         _load(folder, "text", text, manifest)
     if "probe" in manifest["sha256"]:
-        probe = PositionProbe(spec.height, spec.width)
+        probe = PositionProbe(spec.height, spec.width, num_positions)
         _load(folder, "probe", probe, manifest)
     for module in (tokenizer, action, text, probe):
         if module is not None:
@@ -160,11 +161,6 @@ def model_spec(folder: Path, manifest: Mapping[str, Any]) -> EnvironmentSpec:
     except (KeyError, ValueError) as error:
         raise ModelFolderError(f"{folder} has no usable spec in its manifest ({error}); train it anew with this "
                                "version") from None
-
-
-def num_positions_of(spec: EnvironmentSpec) -> int:
-    """How many positions the models of an environment read off frames: none where it has no ground truth."""
-    return len(PROBE_NAMES) if spec.ground_truth_names else 0
 
 
 def action_model_class(kind: str) -> type[ActionModel] | type[TokenActionModel]:

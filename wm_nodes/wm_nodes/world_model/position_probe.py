@@ -1,4 +1,4 @@
-"""Reads positions off pictures, to measure a world model. Shapes: B images, H W 3 image, P positions (PROBE_NAMES).
+"""Reads positions off pictures, to measure a world model. Shapes: B images, H W 3 image, P positions.
 
 It shares no weights and no layers with the world model, is trained on recorded images only, and is part of no loss of
 the world model, which therefore cannot learn to exploit it.
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from wm_nodes.core.types import FloatArray, UInt8Array
-from wm_nodes.world_model.tokenizer import PROBE_NAMES
+from wm_nodes.world_model.tokenizer import NUM_POSITIONS
 
 CHANNELS = (24, 48, 64, 64)
 HIDDEN = 128
@@ -20,7 +20,7 @@ BATCH = 256
 class PositionProbe(nn.Module):
     """A small convolutional regressor, without pooling, so that places stay places."""
 
-    def __init__(self, height: int, width: int) -> None:
+    def __init__(self, height: int, width: int, num_positions: int = NUM_POSITIONS) -> None:
         super().__init__()
         self.height, self.width = height, width
         layers: list[nn.Module] = []
@@ -31,12 +31,12 @@ class PositionProbe(nn.Module):
         side = [-(-size // 2 ** len(CHANNELS)) for size in (height, width)]
         self.features = nn.Sequential(*layers, nn.Flatten())
         self.regress = nn.Sequential(
-            nn.Linear(previous * side[0] * side[1], HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, len(PROBE_NAMES))
+            nn.Linear(previous * side[0] * side[1], HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, num_positions)
         )
         self.mean: Tensor
         self.std: Tensor
-        self.register_buffer("mean", torch.zeros(len(PROBE_NAMES)))
-        self.register_buffer("std", torch.ones(len(PROBE_NAMES)))
+        self.register_buffer("mean", torch.zeros(num_positions))
+        self.register_buffer("std", torch.ones(num_positions))
 
     def forward(self, pixels_B3HW: Tensor) -> Tensor:
         """Positions (B, P) with zero mean and unit variance over the data; pixels float in [0, 1]."""

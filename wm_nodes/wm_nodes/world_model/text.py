@@ -16,7 +16,7 @@ from wm_nodes.world_model.conditions import text_rows, word_mask
 from wm_nodes.world_model.dynamics import FrameModel, Prediction, task_done_signal
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.sentence_encoder import SentenceCondition, SentenceEncoder
-from wm_nodes.world_model.tokenizer import PROBE_NAMES, Tokenizer
+from wm_nodes.world_model.tokenizer import NUM_POSITIONS, Tokenizer
 from wm_nodes.world_model.transformer import RingCache, TemporalCache
 
 MAX_WORDS = 12
@@ -63,7 +63,7 @@ class TextModel(FrameModel):
 
     def __init__(
         self, config: WorldModelConfig, *, num_tokens: int, latent_dim: int, vocabulary: tuple[str, ...],
-        num_tasks: int, num_positions: int = len(PROBE_NAMES),
+        num_tasks: int, num_positions: int = NUM_POSITIONS,
     ) -> None:
         super().__init__(config, num_tokens, latent_dim, num_tasks, num_positions)
         self.condition: InstructionCondition | SentenceCondition = (

@@ -17,8 +17,8 @@ from wm_nodes.world_model.parts import in_parts
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.quantizer import quantize
 
-PROBE_NAMES = ("object_x", "object_y", "tool_x", "tool_y", "tool_z", "goal_x", "goal_y")
-"""Ground-truth values that the state probe reads off a frame's latents, see probe_targets."""
+NUM_POSITIONS = 7
+"""Of an object, a tool and a goal on a table, see world_model/positions.py."""
 
 
 def normalise_tokens(latents: Tensor) -> Tensor:
@@ -52,7 +52,7 @@ class Tokenizer(nn.Module):
     """
 
     def __init__(
-        self, config: TokenizerConfig, height: int, width: int, num_positions: int = len(PROBE_NAMES)
+        self, config: TokenizerConfig, height: int, width: int, num_positions: int = NUM_POSITIONS
     ) -> None:
         super().__init__()
         patch = config.patch_px
@@ -121,7 +121,7 @@ class Tokenizer(nn.Module):
         return change.float() / 2 + self.background
 
     def read_state(self, latents_BSD: Tensor) -> Tensor:
-        """Probed ground truth (B, P) in the units of PROBE_NAMES."""
+        """Probed ground truth (B, P) in its units."""
         return self.read_state_normalised(latents_BSD) * self.probe_std + self.probe_mean
 
     def read_state_normalised(self, latents_BSD: Tensor) -> Tensor:

@@ -116,8 +116,7 @@ def test_the_frames_that_are_shown_lie_evenly_and_are_as_many_as_the_judge_takes
 
 
 @pytest.mark.parametrize(
-    "changes", [{"kind": "embedded"}, {"routes": [{"stages": ["TC"], "endpoints": ["http://b/v1"], "model": "b"}]},
-                {"fallbacks": [{"kind": "embedded"}]}],
+    "changes", [{"kind": "embedded"}, {"routes": [{"stages": ["TC"], "endpoints": ["http://b/v1"], "model": "b"}]}],
 )
 def test_a_judge_that_has_no_probability_of_a_word_is_refused_before_anything_is_judged(
     changes: dict[str, Any],

@@ -14,6 +14,7 @@ from urllib.parse import quote
 
 import pytest
 from chat_server import ChatServer, Fault
+from deadlines import within
 
 from wm_nodes.core.optional import MissingPackageError
 from wm_nodes.judge.backends.answer_limit import ANSWER_BYTES
@@ -95,7 +96,7 @@ def test_retry_after_is_waited_for_and_outside_the_deadline_it_ends_the_call() -
         server.faults.append(Fault("status", 429, retry_after="1"))
         began = time.monotonic()
         await transport.complete(BODY, timeout_s=1)
-        assert 1.0 <= time.monotonic() - began < 3
+        assert 1.0 <= time.monotonic() - began < within(3)
         server.faults.append(Fault("status", 429, retry_after="60"))
         with pytest.raises(TransportError, match=r"past the deadline; last: .*HTTP 429"):
             await transport.complete(BODY, timeout_s=1, deadline=time.monotonic() + 2)
@@ -224,7 +225,7 @@ def test_second_endpoint_answers_at_once_where_the_first_fails() -> None:
             first.faults.append(Fault("status", 429, retry_after="30"))
             began = time.monotonic()
             answer = await transport.complete(BODY, timeout_s=1)
-            assert answer.endpoint == second.url and time.monotonic() - began < 1
+            assert answer.endpoint == second.url and time.monotonic() - began < within(1)
             assert (await transport.complete(BODY, timeout_s=1)).endpoint == first.url
             await transport.close()
 

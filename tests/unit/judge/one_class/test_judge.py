@@ -75,6 +75,7 @@ def share_paid(chosen: Sequence[LabelledClip]) -> float:
     return float(np.mean([judged(clip.job.clip, clip.job.task).reward > 0.5 for clip in chosen]))
 
 
+@pytest.mark.slow
 def test_successes_are_mostly_paid_and_faults_mostly_not() -> None:
     clean_successes = [clip for clip in clips() if clip.truth.family == "clean" and clip.truth.success]
     benign = [clip for clip in clips() if clip.truth.family == "benign" and clip.truth.success]

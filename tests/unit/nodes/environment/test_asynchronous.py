@@ -8,10 +8,12 @@ pytest.importorskip("wm_msgs.msg", reason="wm_msgs is not built")
 from graph.toy import ReachToy
 
 from wm_msgs.msg import ErrorCode
+from wm_nodes.core.errors import WireError
+from wm_nodes.core.lockstep import Goals, LockStep
 from wm_nodes.core.types import FloatArray, StepResult, UInt8Array
 from wm_nodes.nodes.environment.asynchronous import AsynchronousEnvironment
 from wm_nodes.nodes.environment.lockstep import LockstepEnvironment
-from wm_nodes.ros.wire import EpisodeNote, Goals, ResetCommand, TimedAction, Transition, WireError
+from wm_nodes.ros.wire import EpisodeNote, ResetCommand, TimedAction
 
 N = 2
 
@@ -20,7 +22,7 @@ class Published:
     """A sink that keeps what the environment publishes."""
 
     def __init__(self) -> None:
-        self.transitions: list[Transition] = []
+        self.transitions: list[LockStep] = []
         self.stamps: list[int] = []
         self.notes: list[EpisodeNote] = []
 
@@ -29,7 +31,7 @@ class Published:
 
     def goals(self, goals: Goals) -> None: ...
 
-    def transition(self, transition: Transition) -> None:
+    def transition(self, transition: LockStep) -> None:
         self.transitions.append(transition)
 
     def episode(self, note: EpisodeNote) -> None:
@@ -53,7 +55,7 @@ class Bench:
         self.environment.offer(TimedAction(np.full(3 * N, value, np.float32), stamp, policy_version=5))
 
     @property
-    def last(self) -> Transition:
+    def last(self) -> LockStep:
         return self.published.transitions[-1]
 
 

@@ -10,11 +10,13 @@ pytest.importorskip("wm_msgs.msg", reason="wm_msgs is not built")
 from graph.toy import ReachToy
 
 from wm_msgs.msg import EpisodeEvent, ErrorCode
+from wm_nodes.core.errors import WireError
+from wm_nodes.core.lockstep import Goals, LockStep
 from wm_nodes.core.types import FloatArray, StepResult, UInt8Array
 from wm_nodes.nodes.environment.asynchronous import AsynchronousEnvironment
 from wm_nodes.nodes.environment.lockstep import LockstepEnvironment, StampClock
 from wm_nodes.ros.clients import LocalEnvironmentClient
-from wm_nodes.ros.wire import EpisodeNote, Goals, PeerLost, ResetCommand, StepCommand, Transition, WireError
+from wm_nodes.ros.wire import EpisodeNote, PeerLost, ResetCommand, StepCommand
 
 N = 2
 
@@ -40,7 +42,7 @@ class Bench:
 
     def __init__(self, now_ns: int = 1_764_000_000_000_000_000) -> None:
         self.now_ns = now_ns
-        self.transitions: list[Transition] = []
+        self.transitions: list[LockStep] = []
         self.notes: list[EpisodeNote] = []
         self.image_stamps: list[int] = []
         self.goal_stamps: list[int] = []
@@ -54,7 +56,7 @@ class Bench:
     def goals(self, goals: Goals) -> None:
         self.goal_stamps.append(goals.stamp_ns)
 
-    def transition(self, transition: Transition) -> None:
+    def transition(self, transition: LockStep) -> None:
         self.transitions.append(transition)
 
     def episode(self, note: EpisodeNote) -> None:

@@ -11,11 +11,13 @@ pytest.importorskip("wm_msgs.msg", reason="wm_msgs is not built")
 from recording_graph import NUM_ENVS, Graph, assert_same_rollout, write
 from recording_samples import make_spec
 
+from wm_nodes.core.lockstep import DroppedTransitions
 from wm_nodes.core.types import Rollout
-from wm_nodes.nodes.learner.replay_assembler import MAX_KEPT, MAX_WAITING, ReplayAssembler
+from wm_nodes.nodes.learner.rollout_assembler import MAX_KEPT, MAX_WAITING, RolloutAssembler
 from wm_nodes.nodes.learner.rollout_sources import BagRollouts
-from wm_nodes.policy_rl.training_run import DroppedTransitions, Progress
+from wm_nodes.policy_rl.training_run import Progress
 from wm_nodes.recording import BagError, read_rollouts, topics
+from wm_nodes.recording import messages as m
 from wm_nodes.ros import convert
 
 STEPS = 6
@@ -31,26 +33,26 @@ def recorded(*lengths: int) -> Graph:
     return graph
 
 
-def feed(assembler: ReplayAssembler, graph: Graph, keep: Keep = lambda topic, message: True) -> None:
+def feed(assembler: RolloutAssembler, graph: Graph, keep: Keep = lambda topic, message: True) -> None:
     for topic, message, _ in graph.published:
         if not keep(topic, message):
             continue
         if topic is topics.IMAGES:
-            assembler.put_image(convert.time_ns(message.header.stamp), convert.images_of(message, graph.spec))
+            assembler.put_image(m.time_ns(message.header.stamp), m.images_of(message, graph.spec))
         elif topic is topics.TRANSITION:
             assembler.put_transition(convert.transition_of(message, graph.spec))
         elif topic is topics.REWARD:
             assembler.put_rewards(convert.rewards_of(message))
 
 
-def collecting(withheld: list[bool] | None = None) -> ReplayAssembler:
-    assembler = ReplayAssembler((withheld if withheld is not None else []).append)
+def collecting(withheld: list[bool] | None = None) -> RolloutAssembler:
+    assembler = RolloutAssembler((withheld if withheld is not None else []).append)
     assembler.begin(STEPS)
     return assembler
 
 
-def taken(assembler: ReplayAssembler) -> Iterable[tuple[int, Rollout | None, DroppedTransitions]]:
-    while (found := assembler.take(0.0)) is not None:
+def taken(assembler: RolloutAssembler) -> Iterable[tuple[int, Rollout | None, DroppedTransitions]]:
+    while (found := assembler.take_replayed(0.0)) is not None:
         yield found
 
 
@@ -102,13 +104,13 @@ def test_rollouts_of_another_length_are_left_out_as_the_file_does(tmp_path: Path
 def test_a_whole_rollout_ends_in_silence_and_an_unfinished_one_is_waited_for() -> None:
     assembler = collecting()
     feed(assembler, recorded(STEPS))
-    assert assembler.take(60.0) is None
-    found = assembler.take(0.0)
+    assert assembler.take_replayed(60.0) is None
+    found = assembler.take_replayed(0.0)
     assert found is not None
     assert found[1] is not None
     assembler = collecting()
     feed(assembler, recorded(STEPS - 1))
-    assert assembler.take(0.0) is None
+    assert assembler.take_replayed(0.0) is None
 
 
 def test_credit_is_withheld_while_rollouts_wait_and_what_comes_nonetheless_is_counted() -> None:
@@ -120,7 +122,7 @@ def test_credit_is_withheld_while_rollouts_wait_and_what_comes_nonetheless_is_co
     feed(assembler, recorded(*[STEPS] * (MAX_KEPT + 3)))
     assert withheld[-1] is True
     assert assembler.waiting == MAX_KEPT
-    first = assembler.take(0.0)
+    first = assembler.take_replayed(0.0)
     assert first is not None
     assert first[2].gap == 3 * STEPS * NUM_ENVS
     for _ in taken(assembler):
@@ -129,11 +131,11 @@ def test_credit_is_withheld_while_rollouts_wait_and_what_comes_nonetheless_is_co
 
 
 def test_nothing_is_kept_between_goals() -> None:
-    assembler = ReplayAssembler(lambda withheld: None)
+    assembler = RolloutAssembler(lambda withheld: None)
     feed(assembler, recorded(STEPS, STEPS))
     assembler.begin(STEPS)
     assembler.finish()
-    assert assembler.take(0.0) is None
+    assert assembler.take_replayed(0.0) is None
 
 
 def test_a_bag_of_another_camera_is_refused(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ ASKED = ("-h", "--help")
 
 
 def page_file(words: Sequence[str]) -> Path:
-    """The file of a verb, or of one of its commands. words: e.g. benchmark, video-rl, diversity."""
+    """The file of a verb, or of one of its commands. words: e.g. benchmark, diversity."""
     return FOLDER / f"{'-'.join(words)}.txt"
 
 

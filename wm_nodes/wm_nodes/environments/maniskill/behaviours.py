@@ -28,11 +28,13 @@ class Style:
     height_m: float = 0.0
     """Added to the pushing height; 0.05 passes over the cube."""
     noise: float = 0.0
+    """Standard deviation."""
     stop_short_m: float = 0.0
     """The push ends this far before the goal's edge is reached."""
     detours: int = 0
     """Unrelated waypoints before the task."""
     speed: float = 1.0
+    """Share of the largest action."""
 
 
 EXPERT = Style()

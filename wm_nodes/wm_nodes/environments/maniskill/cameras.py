@@ -18,12 +18,16 @@ TOOL_BELOW_HAND_M = 0.1034
 
 @dataclass(frozen=True)
 class Placement:
-    """eye, target: m, in the world frame, or in that of the link panda_hand."""
+    """Where a camera is: in the world frame, or in that of the link panda_hand."""
 
     eye: tuple[float, float, float]
+    """m."""
     target: tuple[float, float, float]
+    """That it looks at, m."""
     fov_rad: float
+    """Vertical field of view."""
     on_hand: bool = False
+    """It moves with the hand."""
 
 
 PLACEMENTS = {

@@ -9,7 +9,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from wm_nodes.config.scenes import Scene, scene_of
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.config.seed_ranges import UNSEEDED
-from wm_nodes.config.tasks import get_task, part_of
+from wm_nodes.config.tasks import get_task, part_of, simulator_part, success
 from wm_nodes.core.cameras import CameraModel, Matrix
 from wm_nodes.core.seeding import stream_seed
 from wm_nodes.core.tool_control import check_actions, next_state
@@ -34,7 +34,8 @@ class ManiSkillEnvironment:
         pictures: bool = True, new_physics: bool = True,
     ) -> None:
         self.spec = simulation_spec(task, config, num_envs)
-        self._task = get_task(task)
+        self._task = simulator_part(task)
+        self._codes = get_task(task).parts
         self._parts = [task] * num_envs
         self._config = config
         self._seed = seed
@@ -66,8 +67,8 @@ class ManiSkillEnvironment:
     @property
     def instructions(self) -> tuple[str, ...]:
         """Of each environment's episode: where the task has many scenes, that of its scene."""
-        told = ((get_task(part).instruct, shown) for part, shown in zip(self._parts, self._shown, strict=True))
-        return tuple(instruct(shown) if instruct and shown else self.spec.instruction for instruct, shown in told)
+        shown = ((simulator_part(part).instruct, scene) for part, scene in zip(self._parts, self._shown, strict=True))
+        return tuple(instruct(scene) if instruct and scene else self.spec.instruction for instruct, scene in shown)
 
     @property
     def shown_scenes(self) -> tuple[Scene | None, ...]:
@@ -113,12 +114,12 @@ class ManiSkillEnvironment:
             tool[:] = self._control.step(self._scenes[i], tool, target[: len(tool)])
             self._steps[i] += 1
             self._observe(i)
-            terminated[i] = self._end_on_success and bool(self._task.success(self._truth[i]))
+            terminated[i] = self._end_on_success and bool(success(self.spec.task, self._truth[i]))
             truncated[i] = not terminated[i] and self._steps[i] >= self.spec.max_episode_steps
             self._ended[i] = terminated[i] or truncated[i]
         return StepResult(
             observation=self.current(), terminated=terminated, truncated=truncated,
-            success_probability=self._task.success(self._truth).astype(np.float32),
+            success_probability=success(self.spec.task, self._truth).astype(np.float32),
             uncertainty=np.zeros(num_envs, np.float32), ground_truth=self._truth.copy(), valid=valid,
         )
 
@@ -131,7 +132,7 @@ class ManiSkillEnvironment:
 
     def _start(self, i: int) -> None:
         self._first_truth[i] = self._task.measure(self._scenes[i], None)
-        code = [part == self._parts[i] for part in self._task.parts]
+        code = [part == self._parts[i] for part in self._codes]
         self._states[i] = [*self._control.state(self._scenes[i]), *code]
         self._observe(i)
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from wm_nodes.config.tasks import get_task, success
+from wm_nodes.config.tasks import simulator_part, success
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.tool_control import moves_pose
@@ -26,7 +26,7 @@ def scripted_episode(env: ManiSkillEnvironment, behaviour: str, seed: int, episo
     """One episode of a scripted behaviour; everything random follows from `seed`."""
     env.reset(seeds=np.array([seed], np.uint64))
     truth, rng = env.ground_truth[0], numpy_stream(seed, "behaviour")
-    script = get_task(env.spec.task).script
+    script = simulator_part(env.spec.task).script
     scripted = (
         extreme_actions(rng, env.spec.action_dim) if behaviour == EXTREME
         else script(behaviour, truth, rng, env.spec.action_scale[0])
@@ -85,7 +85,7 @@ def planned_episode(
     """One MPLib demonstration. behaviour: one of planned_behaviours. Raises PlanningError where no path is found."""
     env.reset(seeds=np.array([seed], np.uint64))
     if moves_pose(env.spec):
-        waypoints = get_task(env.spec.task).waypoints(env.ground_truth[0])
+        waypoints = simulator_part(env.spec.task).waypoints(env.ground_truth[0])
         varied = vary(behaviour, waypoints, planner.start(), numpy_stream(seed, "behaviour"))
         path_follower = track(planner.pose_path(varied), env.spec)
     else:

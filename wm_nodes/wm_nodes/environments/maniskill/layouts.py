@@ -19,14 +19,18 @@ MAX_TRIES = 10_000
 
 @dataclass(frozen=True)
 class Layout:
-    """object: x y. object_yaw: rad. container: x y. goal: x y of the place that the task is about. carpet: whether a
-    carpet lies there."""
+    """Where things lie on the table."""
 
     object: Point
+    """x y."""
     object_yaw: float
+    """rad."""
     container: Point
+    """x y."""
     goal: Point
+    """x y of the place that the task is about."""
     carpet: bool = False
+    """Whether a carpet lies there."""
 
 
 Place = Callable[[np.random.Generator], Layout]

@@ -17,6 +17,11 @@ GROUND_TRUTH_NAMES = (
 )
 """object_bottom_z: lowest point of the object above the table. object_speed: m/s. gripper_opening: between the fingers.
 grasped: 1 where both fingers press on the object."""
+POSITIONS = {name: name for name in ("object_x", "object_y", "tool_x", "tool_y", "tool_z")}
+"""What probes learn where the pictures do not show the goal, see config/tasks.py: ModelPart."""
+WITH_GOAL = POSITIONS | {name: name for name in ("goal_x", "goal_y")}
+MIDDLE_M = 0.02
+"""About where the middle of an object is above the table."""
 OBJECT, OBJECT_START = CUBE, CUBE_START
 BOTTOM, SPEED, OPENING, GRASPED, RADIUS, HEIGHT = 11, 12, 13, 14, 17, 18
 CONTAINER = slice(15, 17)

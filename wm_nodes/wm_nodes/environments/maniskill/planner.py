@@ -11,7 +11,7 @@ from collections.abc import Callable
 import mplib
 import numpy as np
 
-from wm_nodes.config.tasks import get_task
+from wm_nodes.config.tasks import simulator_part
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.tool_control import moves_pose
 from wm_nodes.core.types import FloatArray
@@ -67,7 +67,7 @@ class DemonstrationPlanner:
         joints = agent.robot.get_qpos()[0].numpy().astype(np.float64)
         rotation = agent.tcp.pose.q[0].numpy()
         tools = [agent.tcp.pose.p[0].numpy()]
-        waypoints = get_task(self._env.spec.task).waypoints(self._env.ground_truth[0])
+        waypoints = simulator_part(self._env.spec.task).waypoints(self._env.ground_truth[0])
         for number, waypoint in enumerate(waypoints, 1):
             pose = np.concatenate([waypoint, rotation])
             result = self._planner.plan_screw(pose, joints, time_step=PLANNER_TIME_STEP_S)

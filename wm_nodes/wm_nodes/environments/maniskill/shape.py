@@ -11,7 +11,7 @@ from transforms3d.euler import euler2quat
 from transforms3d.quaternions import quat2mat
 
 from wm_nodes.config.extensions import load_file
-from wm_nodes.config.scenes import SHAPE_FILES, shapes
+from wm_nodes.config.scenes import shapes
 from wm_nodes.core.types import FloatArray
 
 UPRIGHT = sapien.Pose(q=euler2quat(0, np.pi / 2, 0))
@@ -40,7 +40,7 @@ def get_shape(name: str) -> Shape:
     """
     if name not in (known := shapes()):
         raise ValueError(f"unknown shape {name!r}; choose one of {', '.join(known)}")
-    return load_file(name, known, Shape, SHAPE_FILES)
+    return load_file(name, known, Shape, __name__)
 
 
 def bottom_m(name: str, height: float, quaternion: Sequence[float]) -> float:

@@ -10,6 +10,11 @@ GROUND_TRUTH_NAMES = (
     "cube_x", "cube_y", "cube_z", "cube_yaw", "tool_x", "tool_y", "tool_z", "goal_x", "goal_y",
     "cube_start_x", "cube_start_y",
 )
+POSITIONS = {
+    "object_x": "cube_x", "object_y": "cube_y", "tool_x": "tool_x", "tool_y": "tool_y", "tool_z": "tool_z",
+    "goal_x": "goal_x", "goal_y": "goal_y",
+}
+"""What probes learn, see config/tasks.py: ModelPart."""
 CUBE, TOOL, GOAL, CUBE_START = slice(0, 3), slice(4, 7), slice(7, 9), slice(9, 11)
 GOAL_RADIUS_M = 0.1
 """ManiSkill's PushCube-v1 and PullCube-v1."""

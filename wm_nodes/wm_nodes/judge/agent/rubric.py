@@ -42,11 +42,14 @@ class StageRubric(RubricSection):
     threshold: Share
     """theta: a lower stage score is a failed gate."""
     profile: Profile
+    """Which frames a read sees."""
     components: Annotated[dict[Component, ComponentRubric], Field(min_length=1)]
+    """By name, in the order of the table."""
 
 
 class PlanningRubric(RubricSection):
     question: Text
+    """What is asked of the clip as a whole."""
     levels: Annotated[tuple[str, ...], Field(min_length=NUM_PLAN_LEVELS, max_length=NUM_PLAN_LEVELS)]
     """What L0 invalid to L3 good look like."""
     weights: Annotated[tuple[Row, ...], Field(min_length=NUM_PLAN_LEVELS, max_length=NUM_PLAN_LEVELS)]
@@ -89,11 +92,14 @@ class VotingRubric(RubricSection):
 
 
 class Cap(RubricSection):
-    """What a confirmed pattern does: a component's s is at most `ceiling`; or a whole stage fails with s = 0."""
+    """What a confirmed pattern does: it limits a component, or fails a whole stage with s = 0."""
 
     component: Component | None = None
+    """Whose s is limited."""
     ceiling: Share = 0.0
+    """The most that its s may be."""
     stage: Stage | None = None
+    """That fails instead."""
 
     @model_validator(mode="after")
     def _check_target(self) -> "Cap":
@@ -114,6 +120,7 @@ class HackRubric(RubricSection):
     confirm: Share
     """A pattern this probable in two reads is confirmed."""
     patterns: dict[str, PatternRubric]
+    """By name."""
 
 
 class Conflict(RubricSection):
@@ -125,14 +132,17 @@ class Conflict(RubricSection):
 
 class ReflectionRubric(RubricSection):
     enabled: bool
+    """Look again at all."""
     margin: Share
     """A component that decided a gate with a smaller margin is looked at again."""
     level_gap: Annotated[float, Field(gt=0)]
     """Planning level against 3 x mean stage score: a difference of this much is looked at again."""
     max_changes: Annotated[int, Field(ge=1)]
+    """Components of one second look."""
     audit_share: Share
     """Share of clips, drawn by content, that are looked at again without another reason."""
     conflicts: tuple[Conflict, ...]
+    """Pairs that contradict each other."""
 
 
 class RewardRubric(RubricSection):
@@ -144,13 +154,21 @@ class RewardRubric(RubricSection):
 
 class Rubric(RubricSection):
     name: Text
+    """Of the pack."""
     revision: Annotated[int, Field(ge=1)]
+    """Raised by its author with every change of words."""
     planning: PlanningRubric
+    """The first read."""
     stages: dict[Stage, StageRubric]
+    """Those that are scored and gated."""
     voting: VotingRubric
+    """When components are asked again."""
     hack: HackRubric
+    """The hacking patterns."""
     reflection: ReflectionRubric
+    """The second look."""
     reward: RewardRubric
+    """How scores become a number."""
 
     @model_validator(mode="after")
     def _check_names(self) -> "Rubric":

@@ -61,16 +61,18 @@ class Profile(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class ClipRef:
-    """A clip to judge. frames: uint8 (T, H, W, 3), RGB; fps > 0. Nothing is checked here: PRECHECK says what is wrong.
-
-    sha256: of shape, fps and pixels, see clip_ref.
-    """
+    """A clip to judge. Nothing is checked here: PRECHECK says what is wrong."""
 
     clip_id: str
+    """Its name."""
     sha256: str
+    """Of shape, fps and pixels, see clip_ref."""
     frames: UInt8Array
+    """uint8 (T, H, W, 3), RGB."""
     fps: float
+    """Frames per second, > 0."""
     source: Literal["rollout", "real", "adversarial"] = "rollout"
+    """Where it comes from."""
 
     @property
     def duration_s(self) -> float:
@@ -92,16 +94,20 @@ def media_sha(frames: NDArray[Any], fps: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class TaskSpec:
-    """What the clip should show. reference_frame: uint8 (H, W, 3), the conditioning image. goal_image: the same shape.
-    actions: float32 (T - 1, A), action t moves frame t to frame t + 1; None where nobody knows.
-    """
+    """What the clip should show."""
 
     instruction: str
+    """To the robot, in words."""
     task_id: str
+    """Name of the task; "" where unknown."""
     robot: str
+    """Description for the prompt."""
     reference_frame: UInt8Array
+    """uint8 (H, W, 3), the conditioning image."""
     goal_image: UInt8Array | None = None
+    """The same shape; None: there is none."""
     actions: FloatArray | None = None
+    """float32 (T - 1, A), action t moves frame t to frame t + 1; None where nobody knows."""
 
 
 Evidence = Mapping[Component, float]

@@ -13,39 +13,54 @@ from wm_nodes.judge.agent.types import Component, Stage, Status
 
 @dataclass(frozen=True)
 class StageScore:
-    """A gated stage. s in [0, 1], NaN unless OK. passed: s >= theta and no veto."""
+    """A gated stage."""
 
     stage: Stage
+    """One of GATED."""
     status: Status
+    """OK, or why there is no number."""
     s: float
+    """In [0, 1], NaN unless OK."""
     passed: bool
+    """s >= theta and no veto."""
     components: tuple[ComponentScore, ...] = ()
+    """What it is made of."""
     vetoed_by: str = ""
+    """A component, or "hack" and a pattern; "" without a veto."""
 
 
 @dataclass(frozen=True)
 class PlanResult:
-    """p_level: (4,), probabilities of L0 to L3; level: the likeliest. weights: of VQ, IF, TC, PC, as the reward uses
-    them. focus: up to three components to vote first.
-    """
+    """The first look at the whole clip."""
 
     p_level: tuple[float, ...]
+    """(4,), probabilities of L0 to L3."""
     level: int
+    """The likeliest."""
     weights: Mapping[Stage, float]
+    """Of VQ, IF, TC, PC, as the reward uses them."""
     focus: tuple[Component, ...]
+    """Up to three components to vote first."""
     reason: str
+    """In words."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """A component as reflection sees it. before, after: s. accepted: a fresh label read on `frames` agreed."""
+    """A component as reflection sees it."""
 
     component: Component
+    """Its name."""
     before: float
+    """s as it was."""
     after: float
+    """s as proposed."""
     reason: str
+    """In words."""
     frames: tuple[int, ...]
+    """Cited ones."""
     accepted: bool
+    """A fresh label read on `frames` agreed."""
 
 
 @dataclass(frozen=True)
@@ -62,52 +77,74 @@ class Reflection:
 
 @dataclass(frozen=True)
 class HackFlag:
-    """One hacking pattern (RA-12). confirmed: two reads agree; only then it caps."""
+    """One hacking pattern (RA-12)."""
 
     pattern: str
+    """Its name."""
     p_present: float
+    """Probability that it is there."""
     confirmed: bool
+    """Two reads agree; only then it caps."""
     evidence_text: str = ""
+    """What was seen."""
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """Origin of a verdict. rubric_version: of the words of its questions (RewardAgent.version). prompt_sha: over the
-    prompts of all reads. started, ended: Unix time, s.
-    """
+    """Origin of a verdict."""
 
     judge_id: str
+    """Who judged."""
     transport: str
+    """How it was asked."""
     model: str
+    """Its name."""
     server_version: str
+    """"" where unknown."""
     rubric_version: str
+    """Of the words of its questions (RewardAgent.version)."""
     prompt_sha: str
+    """Over the prompts of all reads."""
     media_sha: str
+    """Of the clip."""
     seed: int
+    """Of option orders and audits."""
     started: float
+    """Unix time, s."""
     ended: float
+    """Unix time, s."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The agent's result for one clip. reward: in [0, 1], NaN unless status is OK. level: planning level; 0 where
-    PRECHECK found no video, -1 without planning. stages: VQ, IF, TC, PC; TC alone in mode topreward. reason: of any
-    status but OK. audit_id: content hash without times, equal for equal seeds and equal answers of the judge.
-    """
+    """The agent's result for one clip."""
 
     clip_id: str
+    """Its name."""
     status: Status
+    """OK, or why there is no reward."""
     reward: float
+    """In [0, 1], NaN unless status is OK."""
     level: int
+    """Planning level; 0 where PRECHECK found no video, -1 without planning."""
     stages: tuple[StageScore, ...]
+    """VQ, IF, TC, PC; TC alone in mode topreward."""
     plan: PlanResult | None
+    """None without planning."""
     reflections: tuple[Reflection, ...]
+    """Second looks."""
     hack_flags: tuple[HackFlag, ...]
+    """Of the patterns that were read."""
     cost: Cost
+    """Of all reads."""
     provenance: Provenance
+    """Where it comes from."""
     reason: str = ""
+    """Of any status but OK."""
     num_reads: int = 0
+    """Components that were asked, each time counted."""
     audit_id: str = ""
+    """Content hash without times, equal for equal seeds and equal answers of the judge."""
 
     @property
     def valid(self) -> bool:

@@ -22,12 +22,16 @@ from wm_nodes.reports.console_table import decimal, percent
 
 @dataclass(frozen=True)
 class LabelledEvaluation:
-    """One evaluation with its labels. weight: clips of the round it stands for. by: a label per person who gave one."""
+    """One evaluation with its labels."""
 
     evaluation: RecordedEvaluation
+    """What was judged."""
     rubric: Rubric
+    """By which."""
     weight: float
+    """Clips of the round it stands for."""
     by: Mapping[str, ClipLabel]
+    """A label per person who gave one."""
 
     def decisions(self) -> dict[str, Decision]:
         """The judge's, those on hacking patterns included: p_pass is the probability that the pattern is absent."""
@@ -63,26 +67,38 @@ class AgreementRow(TableRow):
 
 @dataclass(frozen=True)
 class ReflectionEffect:
-    """What second looks did to labelled components: changed, helpful ones among them, accuracy before and after."""
+    """What second looks did to labelled components."""
 
     changed: int
+    """Whose decision changed."""
     helpful: int
+    """Of these, for the better."""
     n: int
+    """Looked at again."""
     before: float
+    """Share that was right before."""
     after: float
+    """Share that is right after."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """clips: labelled. round_number: None for all rounds together. cost: means per labelled clip, by name."""
+    """The numbers of one round, or of all."""
 
     round_number: int | None
+    """None for all rounds together."""
     clips: int
+    """Labelled."""
     annotators: Sequence[str]
+    """Who labelled."""
     rows: Sequence[AgreementRow]
+    """Of Table 2."""
     reflected: ReflectionEffect
+    """What second looks did."""
     cost: Mapping[str, float]
+    """Means per labelled clip, by name."""
     weighted: bool
+    """To the whole round."""
 
 
 def join_labels(

@@ -36,22 +36,30 @@ class AuditError(ValueError):
 
 @dataclass(frozen=True)
 class Entry:
-    """A line that is as it was written. number: from 1."""
+    """A line that is as it was written."""
 
     number: int
+    """From 1."""
     kind: str
+    """What it holds, see entries.py."""
     body: Mapping[str, Any]
+    """JSON values."""
     hash: str
+    """SHA-256 of the line without it."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a line. start: byte of the file where it begins. torn: a crash did it, nothing comes after."""
+    """What is wrong with a line."""
 
     number: int
+    """From 1."""
     what: str
+    """In words."""
     start: int
+    """Byte of the file where it begins."""
     torn: bool = False
+    """A crash did it, nothing comes after."""
 
     def __str__(self) -> str:
         return f"line {self.number}: {self.what}"

@@ -17,11 +17,14 @@ from wm_nodes.judge.audit.media import MediaStore
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a question has no answer. error: the exception's name; "CancelledError" where the clip ran out of time."""
+    """Why a question has no answer."""
 
     error: str
+    """The exception's name; "CancelledError" where the clip ran out of time."""
     reason: str
+    """In words."""
     cost: Mapping[str, Any] | None
+    """Of the attempts; None where unknown."""
 
 
 @dataclass
@@ -29,40 +32,59 @@ class Ask:
     """One question to the judge with its answers."""
 
     stage: str
+    """What it was for."""
     components: tuple[str, ...]
+    """Asked about."""
     votes: tuple[Vote, ...]
+    """How."""
     media: tuple[MediaItem, ...]
+    """Shown images."""
     reads: list[Read] = field(default_factory=list)
+    """The answers."""
     failure: Failure | None = None
+    """None where there are answers."""
 
 
 @dataclass(frozen=True)
 class AgentLine:
-    """Who judged: what the judge can do, and RewardAgent's settings. number: of the line."""
+    """Who judged."""
 
     number: int
+    """Of the line."""
     capabilities: Capabilities
+    """What the judge can do."""
     rubric_version: str
+    """Of the words of the questions."""
     settings: Mapping[str, Any]
+    """RewardAgent's."""
 
 
 @dataclass
 class RecordedEvaluation:
-    """One clip being judged once. number: of its line, its name. outcome: None where the process died before.
-    redacted: a secret in the verdict was replaced, so that it has another content than its audit id says.
-    """
+    """One clip being judged once."""
 
     number: int
+    """Of its line, its name."""
     clip_id: str
+    """Of the clip."""
     sha256: str
+    """Of its content."""
     round_number: int
+    """Of the training, or of clips of your own."""
     agent: AgentLine
+    """Who judged."""
     task: Mapping[str, Any]
+    """As JSON values."""
     evidence: Mapping[str, float]
+    """Beside the answers."""
     asks: list[Ask] = field(default_factory=list)
+    """All questions."""
     exchanges: list[Mapping[str, Any]] = field(default_factory=list)
+    """What went over the wire."""
     outcome: Verdict | None = None
+    """None where the process died before."""
     redacted: bool = False
+    """A secret in the verdict was replaced, so that it has another content than its audit id says."""
 
     @property
     def verdict(self) -> Verdict:
@@ -74,14 +96,20 @@ class RecordedEvaluation:
 
 @dataclass
 class Record:
-    """All of a log. clips: clip lines by the clip's SHA-256. head: hash of the last line."""
+    """All of a log."""
 
     folder: Path
+    """Of the log."""
     rubrics: dict[str, Rubric]
+    """By version."""
     clips: dict[str, Mapping[str, Any]]
+    """Clip lines by the clip's SHA-256."""
     evaluations: dict[int, RecordedEvaluation]
+    """By number."""
     head: str
+    """Hash of the last line."""
     num_lines: int
+    """Of the log."""
 
     @property
     def store(self) -> MediaStore:
@@ -152,16 +180,20 @@ def _add_line(record: Record, agents: dict[int, AgentLine], asks: dict[int, Ask]
 
 @dataclass(frozen=True)
 class VerifyReport:
-    """What `verify` found. problems: none for a sound log. verdicts: the hash of all audit ids, in whatever order the
-    clips were judged: equal for equal seeds and equal answers.
-    """
+    """What `verify` found."""
 
     problems: Sequence[str]
+    """None for a sound log."""
     num_lines: int = 0
+    """Of the log."""
     num_evaluations: int = 0
+    """Of the log."""
     unfinished: int = 0
+    """Evaluations without a verdict."""
     head: str = ""
+    """Hash of the last line."""
     verdicts: str = ""
+    """The hash of all audit ids, in whatever order the clips were judged: equal for equal seeds and equal answers."""
 
 
 def verify(folder: Path, *, pictures: bool = True, expected_head: str = "") -> VerifyReport:

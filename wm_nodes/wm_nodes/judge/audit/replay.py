@@ -73,11 +73,14 @@ def _rebuild_error(failure: Failure) -> Exception:
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """before: as it was recorded. after: worked out again; None where it ran out of time, which nothing repeats."""
+    """A verdict and the same worked out again."""
 
     evaluation: RecordedEvaluation
+    """What was judged."""
     before: Verdict
+    """As it was recorded."""
     after: Verdict | None
+    """Worked out again; None where it ran out of time, which nothing repeats."""
 
     @property
     def equal(self) -> bool:

@@ -37,29 +37,40 @@ SECOND_SHARE = 0.2
 
 @dataclass(frozen=True)
 class SampledClip:
-    """A clip to look at. stratum: what it was drawn for. weight: how many clips of the round it stands for. second: a
-    second person should label it too.
-    """
+    """A clip to look at."""
 
     evaluation: int
+    """Its number in the log."""
     clip_id: str
+    """Of the clip."""
     audit_id: str
+    """Of the verdict."""
     stratum: str
+    """What it was drawn for."""
     weight: float
+    """How many clips of the round it stands for."""
     second: bool
+    """A second person should label it too."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """head: of the log when it was drawn. population: clips of the round with a verdict. sizes: clips by stratum."""
+    """The clips of a round that people should look at."""
 
     head: str
+    """Of the log when it was drawn."""
     round_number: int
+    """In the log."""
     seed: int
+    """Of the draw."""
     population: int
+    """Clips of the round with a verdict."""
     mean_reward: float
+    """Of those with one."""
     sizes: dict[str, int]
+    """Clips by stratum."""
     chosen: tuple[SampledClip, ...]
+    """In the order of the log."""
 
 
 def sample_size(mean_reward: float, population: int) -> int:

@@ -40,26 +40,29 @@ Exchange = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class ChatOptions:
-    """json_timeout_s, label_timeout_s: per try. budget_s: all calls of one ReadRequest together, waits included.
-
-    max_answer_tokens: of a JSON answer, if extra_body sets none; one that needs more has failed. label_token_ids: token
-    ids of A to E, where the server can be asked for their probabilities by id. choice_grammar: label reads choose among
-    the letters only, so that the label mass no longer warns. max_images: that the server takes in one call. video: the
-    dense profile goes as one video (vLLM, --limit-mm-per-prompt with a video), else as images. repeat_share: of the
-    calls that are asked twice, so that it is known how often a live server contradicts itself; the first answer counts.
-    extra_body: further fields of every request.
-    """
+    """How a server is asked."""
 
     json_timeout_s: float = 120.0
+    """Per try of a JSON answer."""
     label_timeout_s: float = 60.0
+    """Per try of a letter."""
     budget_s: float = 300.0
+    """All calls of one ReadRequest together, waits included."""
     max_answer_tokens: int = 1024
+    """Of a JSON answer, if extra_body sets none; one that needs more has failed."""
     label_token_ids: tuple[int, ...] = ()
+    """Token ids of A to E, where the server can be asked for their probabilities by id."""
     choice_grammar: bool = False
+    """Label reads choose among the letters only, so that the label mass no longer warns."""
     max_images: int = 64
+    """That the server takes in one call."""
     video: bool = False
+    """The dense profile goes as one video (vLLM, --limit-mm-per-prompt with a video), else as images."""
     repeat_share: float = 0.0
+    """Of the calls that are asked twice, so that it is known how often a live server contradicts itself; the first
+    answer counts."""
     extra_body: Mapping[str, Any] = field(default_factory=dict)
+    """Further fields of every request."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.repeat_share <= 1:
@@ -72,14 +75,20 @@ class ChatOptions:
 
 @dataclass(frozen=True)
 class Call:
-    """Some components of a request, to one vote. media: as sent. deadline: on the time.monotonic clock, s."""
+    """Some components of a request, to one vote."""
 
     request: ReadRequest
+    """That it is part of."""
     media: list[Part]
+    """As sent."""
     media_sha: str
+    """SHA-256 of them."""
     deadline: float
+    """On the time.monotonic clock, s."""
     vote: Vote
+    """How they are asked."""
     components: tuple[Component, ...]
+    """Those of this call."""
 
 
 class Prompt:

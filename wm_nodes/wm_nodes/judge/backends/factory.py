@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from wm_nodes.config.schema import JudgeConfig, OtherJudge, StageJudge
+from wm_nodes.config.schema import JudgeConfig, StageJudge
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.device import CPU
 from wm_nodes.judge.agent import topreward
@@ -25,7 +25,7 @@ from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPoli
 from wm_nodes.judge.one_class.ranges import KEPT, has_ranges
 from wm_nodes.world_model.folder import read_world_manifest
 
-AnyJudge = TypeVar("AnyJudge", JudgeConfig, OtherJudge, StageJudge)
+AnyJudge = TypeVar("AnyJudge", JudgeConfig, StageJudge)
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
@@ -37,40 +37,28 @@ class OpenedJudge:
     close: Callable[[], Coroutine[Any, Any, None]]
 
 
-def judges_of(settings: JudgeConfig) -> list[JudgeConfig]:
-    """The judge with its routes, and its fallbacks, in the order in which they are tried; none has fallbacks itself."""
-    first = settings.model_copy(update={"fallbacks": []})
-    return [first, *(_single_judge(settings, other) for other in settings.fallbacks)]
+def _all_of(settings: JudgeConfig) -> list[JudgeConfig | StageJudge]:
+    """The judge and those of some stages."""
+    return [settings, *settings.routes]
 
 
-def _single_judge(settings: JudgeConfig, other: OtherJudge) -> JudgeConfig:
-    """The settings of another judge, who has nobody beside it."""
-    given = {name: getattr(other, name) for name in OtherJudge.model_fields}
-    return settings.model_copy(update={**given, "routes": [], "fallbacks": []})
+def _route_judge(settings: JudgeConfig, route: StageJudge) -> JudgeConfig:
+    """The settings of the judge of some stages, who has nobody beside it."""
+    given = {name: getattr(route, name) for name in StageJudge.model_fields if name != "stages"}
+    return settings.model_copy(update={**given, "routes": []})
 
 
 def check_judge(settings: JudgeConfig) -> None:
     """Refuse settings that name no judge. Raises ValueError: names setting and remedy, never what may be a key."""
     _check_one(settings)
-    for kind, others in (("routes", settings.routes), ("fallbacks", settings.fallbacks)):
-        for number, other in enumerate(others):
-            try:
-                _check_one(_single_judge(settings, other))
-            except ValueError as error:
-                raise ValueError(f"judge.{kind}[{number}]: {error}") from None
+    for number, route in enumerate(settings.routes):
+        try:
+            _check_one(_route_judge(settings, route))
+        except ValueError as error:
+            raise ValueError(f"judge.routes[{number}]: {error}") from None
     stages = [stage for route in settings.routes for stage in route.stages]
     if twice := sorted({stage for stage in stages if stages.count(stage) > 1}):
         raise ValueError(f"judge.routes names {', '.join(twice)} more than once; one judge reads a stage")
-    seen = list[tuple[object, ...]]()
-    for number, judge in enumerate(judges_of(settings)):
-        name = judge.model if judge.kind == "openai" else judge.folder
-        identity = (judge.kind, name, judge.routes)
-        if identity in seen:
-            raise ValueError(
-                f"judge.fallbacks[{number - 1}] is {name!r} once more; further servers of one model belong into the "
-                "endpoints of its judge"
-            )
-        seen.append(identity)
 
 
 def _check_one(settings: JudgeConfig) -> None:
@@ -114,8 +102,7 @@ def for_task(settings: JudgeConfig, task: str) -> JudgeConfig:
             return judge
         return judge.model_copy(update={"folder": str(_shipped(task))})
 
-    routes, fallbacks = [*map(name_folder, settings.routes)], [*map(name_folder, settings.fallbacks)]
-    return name_folder(settings).model_copy(update={"routes": routes, "fallbacks": fallbacks})
+    return name_folder(settings).model_copy(update={"routes": [*map(name_folder, settings.routes)]})
 
 
 def _shipped(task: str) -> Path:
@@ -131,7 +118,7 @@ def _shipped(task: str) -> Path:
 
 
 def check_clips(settings: JudgeConfig, shape: tuple[int, ...], fps: float | None = None) -> None:
-    """Refuse a judge that would abstain on every such clip; likewise routed ones and fallbacks. Servers take any.
+    """Refuse a judge that would abstain on every such clip; likewise routed ones. Servers take any.
 
     Args:
         settings: of for_task.
@@ -141,8 +128,7 @@ def check_clips(settings: JudgeConfig, shape: tuple[int, ...], fps: float | None
     Raises:
         ValueError: names the shape and the remedy; or the folder holds no judge.
     """
-    others: list[OtherJudge] = [*settings.routes, *settings.fallbacks]
-    for judge in (settings, *(_single_judge(settings, other) for other in others)):
+    for judge in _all_of(settings):
         if judge.kind != "embedded":
             continue
         folder = Path(judge.folder)
@@ -159,8 +145,8 @@ def evidence_judge(settings: JudgeConfig, model_dir: Path | None, device: str = 
     """The judge in this process whose numbers are the evidence beside a server's answers (RA-17); None where no server
     judges, or the world model has no normal ranges.
     """
-    judges: list[JudgeConfig | OtherJudge] = [settings, *settings.routes, *settings.fallbacks]
-    if model_dir is None or all(judge.kind == "embedded" for judge in judges) or not has_ranges(model_dir):
+    embedded = all(judge.kind == "embedded" for judge in _all_of(settings))
+    if model_dir is None or embedded or not has_ranges(model_dir):
         return None
     return OneClassJudge(model_dir, device=device)
 
@@ -170,7 +156,7 @@ def judge_name(settings: JudgeConfig) -> str:
     embedded = settings.kind == "embedded"
     who = f"embedded judge {settings.folder or 'of the task'}"
     name = who if embedded else f"{settings.model} at {', '.join(settings.endpoints)}"
-    by = [f"{'+'.join(route.stages)} by {judge_name(_single_judge(settings, route))}" for route in settings.routes]
+    by = [f"{'+'.join(route.stages)} by {judge_name(_route_judge(settings, route))}" for route in settings.routes]
     return "; ".join([name, *by])
 
 
@@ -195,7 +181,7 @@ def make_judge(
     first = open_judge(settings)
     if not settings.routes:
         return first
-    routed = [open_judge(_single_judge(settings, route)) for route in settings.routes]
+    routed = [open_judge(_route_judge(settings, route)) for route in settings.routes]
     routes = [([Stage(s) for s in r.stages], o.judge) for r, o in zip(settings.routes, routed, strict=True)]
 
     async def close() -> None:

@@ -19,17 +19,25 @@ class ChoiceLogprobs(BaseModel):
 
 
 class Message(BaseModel):
-    """reasoning, reasoning_content: where servers put a model's thoughts; no part of the answer."""
+    """What the model said."""
 
     content: str | None = None
+    """The answer."""
     reasoning: Any = None
+    """Where servers put a model's thoughts; no part of the answer."""
     reasoning_content: Any = None
+    """The same, of other servers."""
 
 
 class Choice(BaseModel):
+    """One answer."""
+
     message: Message
+    """Of the model."""
     finish_reason: str | None = None
+    """"length" where it was cut off."""
     logprobs: ChoiceLogprobs | None = None
+    """Where they were asked for."""
 
 
 class PromptTokens(BaseModel):
@@ -37,9 +45,14 @@ class PromptTokens(BaseModel):
 
 
 class Usage(BaseModel):
+    """Tokens of a request."""
+
     prompt_tokens: int = 0
+    """Sent."""
     completion_tokens: int = 0
+    """Received."""
     prompt_tokens_details: PromptTokens | None = None
+    """How many of them the server had."""
 
     @property
     def cached_tokens(self) -> int:
@@ -50,5 +63,8 @@ class Completion(BaseModel):
     """A body that came with HTTP 200; anything that does not fit is no answer."""
 
     choices: list[Choice] = Field(min_length=1)
+    """One."""
     model: str = ""
+    """Its name."""
     usage: Usage = Field(default_factory=Usage)
+    """What it took."""

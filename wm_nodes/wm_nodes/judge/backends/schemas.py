@@ -40,13 +40,18 @@ class AnswerError(ValueError):
 
 @dataclass(frozen=True)
 class ComponentAnswer:
-    """What an answer says of one component, whatever its call type. level: of PLANNING 0..3, else 0..4."""
+    """What an answer says of one component, whatever its call type."""
 
     component: Component
+    """Its name."""
     level: int
+    """Of PLANNING 0..3, else 0..4."""
     evidence: str = ""
+    """In words."""
     frames: tuple[int, ...] = ()
+    """Cited ones."""
     focus: tuple[Component, ...] = ()
+    """Of PLANNING, components with a visible problem."""
 
 
 class _Strict(BaseModel):

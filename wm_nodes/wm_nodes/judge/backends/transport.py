@@ -44,15 +44,17 @@ class TransportError(RuntimeError):
 
 @dataclass(frozen=True)
 class Endpoint:
-    """One server. base_url: with its /v1. model: the name the server knows. api_key_env: the environment variable that
-    holds the key, "" for a server that wants none; a key itself is never part of any setting. Raises ValueError: a URL
-    that is not http(s), or one with a user name or password in it.
-    """
+    """One server. Raises ValueError: a URL that is not http(s), or one with a user name or password in it."""
 
     base_url: str
+    """With its /v1."""
     model: str
+    """The name the server knows."""
     api_key_env: str = ""
+    """The environment variable that holds the key, "" for a server that wants none; a key itself is never part of any
+    setting."""
     max_in_flight: int = 32
+    """Calls under way at once."""
 
     def __post_init__(self) -> None:
         parts = urlsplit(self.base_url)
@@ -81,13 +83,14 @@ class Endpoint:
 
 @dataclass(frozen=True)
 class RetryPolicy:
-    """tries: requests per call at most. Waits are drawn from [0, min(cap_s, base_s 2^i)] before retry i (full jitter);
-    a longer Retry-After is honoured.
-    """
+    """How often and when a call is tried again; a longer Retry-After is honoured."""
 
     tries: int = 4
+    """Requests per call at most."""
     base_s: float = 0.5
+    """Waits are drawn from [0, min(cap_s, base_s 2^i)] before retry i (full jitter)."""
     cap_s: float = 8.0
+    """The longest wait."""
 
     def __post_init__(self) -> None:
         if self.tries < 1 or not 0 <= self.base_s <= self.cap_s:
@@ -96,12 +99,16 @@ class RetryPolicy:
 
 @dataclass(frozen=True)
 class ChatAnswer:
-    """A completion, and what it took. tries: requests sent, at least 1. wall_s: with waits and retries."""
+    """A completion, and what it took."""
 
     completion: Completion
+    """The answer."""
     endpoint: str
+    """URL of the server."""
     tries: int
+    """Requests sent, at least 1."""
     wall_s: float
+    """With waits and retries."""
 
 
 class _Server:

@@ -71,7 +71,7 @@ class Attack:
         return paths
 
     def _ask(self, jobs: list[ClipJob]) -> list[Verdict]:
-        return self._judge.judge(jobs, by=self._judge.judge_ids[0])
+        return self._judge.judge(jobs)
 
     def _is_paid(self, verdict: Verdict) -> bool:
         if self._least is None:

@@ -31,6 +31,7 @@ class Edit:
     """A way to spoil a clip, or a harmless change."""
 
     name: str
+    """For the tables."""
     pattern: str
     """One of PATTERNS, or BENIGN."""
     change: Change

@@ -19,9 +19,11 @@ class Attempt:
     """One edit of one clip that was paid unedited."""
 
     clip_id: str
+    """Of the clip."""
     pattern: str
     """One of PATTERNS, or BENIGN."""
     edit: str
+    """The edit's name."""
     step: int
     """Of STEPS; those of GROSS anybody sees."""
     visible: bool
@@ -29,6 +31,7 @@ class Attempt:
     status: str
     """Of the verdict; "" without one."""
     paid: bool
+    """Whether the judge still pays it."""
     reward: float | None
     """None where the verdict has no number."""
     unedited: float
@@ -46,6 +49,7 @@ class Paid:
     share: float
     """Still paid, of n."""
     low: float
+    """95 % Wilson interval of the share."""
     high: float
     """95 % Wilson interval of the share."""
     silent: float

@@ -8,13 +8,15 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from wm_nodes.config.tasks import get_task, part_of, parts_of, success, task_names
+from wm_nodes.config.tasks import get_task, has_rule, part_of, same_scene, success, task_names
+from wm_nodes.core.action_spaces import tool_columns
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Episode, FloatArray, UInt8Array
 from wm_nodes.judge.one_class import imagination, pictures
 from wm_nodes.judge.one_class.ranges import NormalRanges, done_threshold, fit
 from wm_nodes.world_model import WorldModels
+from wm_nodes.world_model.positions import columns_of
 from wm_nodes.world_model.validation.open_loop import imagine
 
 SHORTEST = 4
@@ -90,12 +92,10 @@ def words_of(instruction: str) -> list[str]:
 
 def done_at(tasks: Sequence[str], episode: Episode, step: int) -> dict[str, bool]:
     """Whether each of the tasks that a recording can show is done at a frame: by its ground truth, or as recorded."""
-    known, own = task_names(), episode.task
-    if own in known and parts_of(own) != (own,):
-        own = part_of(own, episode.seed)
+    own = part_of(episode.task, episode.seed)
     done = {
         task: bool(success(task, episode.ground_truth[step]))
-        for task in tasks if task in known and own in known and get_task(task).scene is get_task(own).scene
+        for task in tasks if has_rule(task) and has_rule(own) and same_scene(task, own)
     }
     return {**done, own: bool(episode.success[step])} if own in tasks else done
 
@@ -168,9 +168,10 @@ def _places(models: WorldModels, episodes: Sequence[Episode]) -> tuple[FloatArra
     """Origin and height_m of NormalRanges, of the first recordings."""
     if models.probe is None:
         raise ValueError("the embedded judge needs a world model with a position probe; train it anew")
-    tools = [models.probe.read(episode.images)[:, imagination.PLACES["tool"]] for episode in episodes[:50]]
+    tools = [models.probe.read(episode.images)[:, columns_of(models.tasks[0], "tool")] for episode in episodes[:50]]
     if not tools:
         raise ValueError("the bags hold no episode that is long enough; name more bags")
-    lacks = [episode.states[:, :3] - tool for episode, tool in zip(episodes, tools)]
+    _, placed = tool_columns(models.spec)
+    lacks = [episode.states[:, placed] - tool for episode, tool in zip(episodes, tools)]
     origin = np.asarray(np.median(np.concatenate(lacks), 0), np.float32)
     return origin, float(np.quantile([tool[:, 2].min() for tool in tools], TOUCHING))

@@ -9,17 +9,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from wm_nodes.core.action_spaces import tool_columns
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.world_model import ActionModel, WorldModels
 from wm_nodes.world_model.dynamics import done_signal
-from wm_nodes.world_model.tokenizer import PROBE_NAMES, normalise_tokens
+from wm_nodes.world_model.positions import columns_of
+from wm_nodes.world_model.tokenizer import normalise_tokens
 
 BLOCK_PX = 8
 """Side of the blocks whose mean error is compared."""
-PLACES = {
-    name: [i for i, found in enumerate(PROBE_NAMES) if found.startswith(name)] for name in ("object", "tool", "goal")
-}
-"""Columns of the position probe that are each thing's place."""
 UNTOUCHED_M, FREE_M = 0.05, 0.08
 """Distance of the tool's path from which an object's move begins to count as untouched, and wholly counts."""
 LEAST_M = 0.003
@@ -48,7 +46,8 @@ def model_numbers(
         height_m: of the object's middle.
 
     Raises:
-        ValueError: frames of another size, a model over discrete tokens, or one without a position probe.
+        ValueError: frames of another size, a model over discrete tokens or without a position probe, or a robot whose
+            tool is not commanded by its position.
     """
     model = models.action
     if not isinstance(model, ActionModel) or models.probe is None:
@@ -58,7 +57,7 @@ def model_numbers(
     redrawn = models.tokenizer.decode(latents)
     missed = (redrawn.float() - torch.from_numpy(frames).to(redrawn.device).float()).abs().mean(3)
     places = models.probe.read(frames)
-    tool, thing, goal = (places[:, PLACES[name]] for name in ("tool", "object", "goal"))
+    tool, thing, goal = (places[:, columns_of(models.tasks[0], name)] for name in ("tool", "object", "goal"))
     imagined, logits = _next_frames(model, models, latents, torch.tensor(tool, device=latents.device), stride, origin)
     error, still = (imagined - latents[1:]).square().mean(), (latents[1:] - latents[:-1]).square().mean()
     moved, went = (np.linalg.norm(np.diff(path, axis=0), axis=1) for path in (thing, tool))
@@ -105,13 +104,13 @@ def _next_frames(
     model: ActionModel, models: WorldModels, latents_TSD: Tensor, tool_T3: Tensor, stride: int, origin: FloatArray
 ) -> tuple[Tensor, Tensor]:
     """The next frame imagined from each true one, (T - 1, S, D), and done logits there (T - 1, heads, J)."""
-    action_dim, state_dim = models.spec.action_dim, models.spec.state_dim
+    moving, placed = tool_columns(models.spec)
     step = tool_T3.diff(dim=0) / stride
-    actions = F.pad((step / models.spec.action_scale[0]).clamp(-1, 1), (0, action_dim - 3))
+    actions = step.new_zeros(len(step), models.spec.action_dim)
+    actions[:, moving] = (step / models.spec.action_scale[moving[0]]).clamp(-1, 1)
     between = torch.stack([tool_T3[:-1] + i * step for i in range(stride + 1)]) + torch.from_numpy(origin).to(tool_T3)
-    states = F.pad(between, (0, state_dim - 3))
-    if state_dim > 3:
-        states[..., 3:] = model.condition.state_mean[3:]
+    states = model.condition.state_mean.to(between).repeat(*between.shape[:2], 1)
+    states[..., placed] = between
     if stride == 1:
         prediction = model(latents_TSD[:-1][None], actions[None], states[0][None], states[1][None])
         return normalise_tokens(latents_TSD[:-1] + prediction.change_BTSD[0]), prediction.done_logits_BTKJ[0]

@@ -11,8 +11,9 @@ from dataclasses import replace
 import numpy as np
 
 from wm_msgs.msg import ErrorCode
+from wm_nodes.core.errors import WireError
 from wm_nodes.nodes.environment.lockstep import LockstepEnvironment
-from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand, TimedAction, WireError
+from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand, TimedAction
 
 REMEMBERED = 256
 """Observations whose time of publication is kept, to tell the age of the actions that answer them."""

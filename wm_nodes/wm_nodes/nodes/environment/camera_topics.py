@@ -8,7 +8,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from wm_nodes.core.cameras import CameraModel, quaternion
 from wm_nodes.core.types import Environment, UInt8Array
-from wm_nodes.recording.messages import BASE_FRAME
+from wm_nodes.recording.messages import BASE_FRAME, time_ns
 from wm_nodes.ros import convert
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.qos import TOPICS
@@ -114,7 +114,7 @@ class CameraTopics:
         env = max(0, int(self._node.param("view_env")))
         if env >= len(images):
             return
-        transforms, stamp_ns = [], convert.time_ns(mosaic.header.stamp)
+        transforms, stamp_ns = [], time_ns(mosaic.header.stamp)
         for place in moving:
             outlets = self._outlets[place]
             try:

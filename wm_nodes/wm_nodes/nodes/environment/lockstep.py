@@ -15,11 +15,14 @@ from typing import Protocol
 import numpy as np
 
 from wm_msgs.msg import EpisodeEvent, ErrorCode
+from wm_nodes.core.errors import WireError
+from wm_nodes.core.lockstep import Goals, LockStep
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.tool_control import hold_actions
 from wm_nodes.core.types import BoolArray, Environment, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
-from wm_nodes.ros.wire import EpisodeNote, Goals, Reply, ResetCommand, StepCommand, Transition, WireError
+from wm_nodes.nodes.environment.running_episodes import RunningEpisodes
+from wm_nodes.ros.wire import EpisodeNote, Reply, ResetCommand, StepCommand
 
 UNIT_TOLERANCE = 1e-6
 
@@ -45,23 +48,27 @@ class Sink(Protocol):
 
     def goals(self, goals: Goals) -> None: ...
 
-    def transition(self, transition: Transition) -> None: ...
+    def transition(self, transition: LockStep) -> None: ...
 
     def episode(self, note: EpisodeNote) -> None: ...
 
 
-@dataclass
-class _Slot:
-    """The running episode of one environment."""
+@dataclass(frozen=True)
+class _Plan:
+    """A lock-step that is allowed, before it is made."""
 
-    episode_id: int = 0
-    seed: int = 0
-    running: bool = False
-    aborted: bool = False
-    """Ended from outside (estop, error, stop): nothing it does counts until it is reset."""
-    length: int = 0
-    version_first: int = 0
-    version_last: int = 0
+    command: StepCommand
+    """What was asked for."""
+    actions: FloatArray
+    """(N, A), checked."""
+    resets: BoolArray
+    """(N,), reset instead of stepped."""
+    seeds: UInt64Array | None
+    """(N,), used where resets is True; None where nothing is reset."""
+    before: Observation
+    """What the actions answer."""
+    stamp_ns: int
+    """Of that observation."""
 
 
 class LockstepEnvironment:
@@ -86,7 +93,6 @@ class LockstepEnvironment:
         self.before_step: Callable[[], None] = lambda: None
         """Called before every change; raises WireError to refuse it (no credit, not active)."""
         self._sink = sink
-        self._behaviour = behaviour
         self._seed, self._draws = seed, 0
         self._lock = threading.Lock()
         self._clock = clock or StampClock()
@@ -94,7 +100,9 @@ class LockstepEnvironment:
         self._last_step_id = 0
         self._last_reply: Reply | WireError | None = None
         self._current: Observation | None = None
-        self._slots = [_Slot() for _ in range(self.spec.num_envs)]
+        self._episodes = RunningEpisodes(
+            self.spec.num_envs, self.spec.max_episode_steps, behaviour, lambda note: sink.episode(note)
+        )
 
     @property
     def next_step_id(self) -> int:
@@ -117,16 +125,16 @@ class LockstepEnvironment:
             if self._current is None and not mask.all():
                 raise WireError(ErrorCode.OUT_OF_ORDER, "the first reset must be of all environments; empty mask")
             seeds = self._seeds(command.seeds)
-            self._end_episodes(mask, EpisodeEvent.REASON_RESET, self._stamp_ns)
-            self._behaviour = command.behaviour or self._behaviour
+            self._episodes.end(mask, EpisodeEvent.REASON_RESET, self._stamp_ns)
+            self._episodes.behaviour = command.behaviour or self._episodes.behaviour
             with self._environment_errors():
                 self._current = self.environment.reset(mask, seeds)
-            stamp = self._stamp_ns = self._clock()
-            reply = self._reply(stamp, command.with_image)
+            self._stamp_ns = self._clock()
+            reply = self._reply(command.with_image)
             self._last_reply = None
-            self._publish_observation(stamp, goals_changed=True)
-            self._start_episodes(mask, seeds, stamp)
-            self._sink.transition(self._reset_transition(stamp))
+            self._publish_observation(goals_changed=True)
+            self._episodes.start(mask, self._current.episode_id, seeds, self._stamp_ns)
+            self._sink.transition(self._reset_lockstep())
             return reply
 
     def step(self, command: StepCommand) -> Reply:
@@ -138,34 +146,19 @@ class LockstepEnvironment:
                 exception of the environment): the episodes these name are over and must be reset.
         """
         with self._lock:
-            if command.session != self.session:
-                raise WireError(
-                    ErrorCode.SPEC_MISMATCH,
-                    f"session {command.session} is not this environment's {self.session}: it was restarted; "
-                    "read env/get_spec again and reset",
-                )
-            if command.spec_hash != self.spec.spec_hash:
-                raise WireError(
-                    ErrorCode.SPEC_MISMATCH,
-                    f"spec_hash {command.spec_hash[:12]!r} is not {self.spec.spec_hash[:12]!r}; ask env/get_spec",
-                )
-            if self._last_reply is not None and command.step_id == self._last_step_id:
-                if isinstance(self._last_reply, WireError):
-                    raise self._last_reply
-                return self._last_reply
-            if command.step_id != self.next_step_id:
-                raise WireError(
-                    ErrorCode.OUT_OF_ORDER,
-                    f"step_id {command.step_id} is neither the last one ({self._last_step_id}) nor the next one "
-                    f"({self.next_step_id}); continue with {self.next_step_id}",
-                )
-            if self._current is None:
-                raise WireError(ErrorCode.OUT_OF_ORDER, "never reset; call env/reset first")
-            actions = self.check_actions(command.actions)
-            resets = command.reset_seeds is not None or (command.reset_mask is not None and command.reset_mask.any())
-            seeds = self._seeds(command.reset_seeds) if resets else None
-            self._gate()
-            return self._step(command, actions, seeds)
+            self._check_client(command)
+            if self._last_reply is None or command.step_id != self._last_step_id:
+                plan, started = self._plan(command), time.perf_counter()
+                result = self._advance(plan)
+                valid, broken = self._judge_ends(plan, result)
+                self._reset_some(plan, result.observation)
+                step = self._lockstep(plan, result, valid)
+                reply = self._answer(plan, step, time.perf_counter() - started)
+                self._publish(plan, step)
+                self._last_reply = _nan_error(broken, command.step_id) if broken.any() else reply
+            if isinstance(self._last_reply, WireError):
+                raise self._last_reply
+            return self._last_reply
 
     def hold_now(self) -> None:
         """Have a robot hold, which without further steps might go on with its last action, outside of any step.
@@ -191,68 +184,89 @@ class LockstepEnvironment:
     def end_episodes(self, reason: int) -> None:
         """End all running episodes, e.g. when the node stops or the estop is set."""
         with self._lock:
-            self._abort(np.ones(self.spec.num_envs, bool), reason, self._stamp_ns)
+            self._episodes.end(np.ones(self.spec.num_envs, bool), reason, self._stamp_ns, abort=True)
 
     def close(self) -> None:
         self.environment.close()
 
-    def _step(self, command: StepCommand, actions: FloatArray, seeds: UInt64Array | None) -> Reply:
-        started = time.perf_counter()
-        before, before_stamp = self._current, self._stamp_ns
-        assert before is not None
+    def _check_client(self, command: StepCommand) -> None:
+        if command.session != self.session:
+            raise WireError(
+                ErrorCode.SPEC_MISMATCH,
+                f"session {command.session} is not this environment's {self.session}: it was restarted; "
+                "read env/get_spec again and reset",
+            )
+        if command.spec_hash != self.spec.spec_hash:
+            raise WireError(
+                ErrorCode.SPEC_MISMATCH,
+                f"spec_hash {command.spec_hash[:12]!r} is not {self.spec.spec_hash[:12]!r}; ask env/get_spec",
+            )
+
+    def _plan(self, command: StepCommand) -> _Plan:
+        """What a new command asks for; refuses one that is wrong or not allowed now."""
+        if command.step_id != self.next_step_id:
+            raise WireError(
+                ErrorCode.OUT_OF_ORDER,
+                f"step_id {command.step_id} is neither the last one ({self._last_step_id}) nor the next one "
+                f"({self.next_step_id}); continue with {self.next_step_id}",
+            )
+        if self._current is None:
+            raise WireError(ErrorCode.OUT_OF_ORDER, "never reset; call env/reset first")
+        actions = self.check_actions(command.actions)
+        resets = np.zeros(self.spec.num_envs, bool) if command.reset_mask is None else command.reset_mask
+        seeds = self._seeds(command.reset_seeds) if resets.any() or command.reset_seeds is not None else None
+        self._gate()
+        return _Plan(command, actions, resets, seeds, self._current, self._stamp_ns)
+
+    def _advance(self, plan: _Plan) -> StepResult:
         with self._environment_errors():
-            result = self.environment.step(actions)
-        mask = command.reset_mask
-        broken = self._running() & ~_finite(result)
-        if mask is not None:
-            broken &= ~mask
-        self._abort(broken, EpisodeEvent.REASON_ERROR, before_stamp)
-        valid = result.valid & self._running()
-        observation = result.observation
-        if mask is not None and mask.any():
-            self._end_episodes(mask, EpisodeEvent.REASON_RESET, before_stamp)
+            return self.environment.step(plan.actions)
+
+    def _judge_ends(self, plan: _Plan, result: StepResult) -> tuple[BoolArray, BoolArray]:
+        """End the episodes of which the model predicted NaN; return which environments stepped, and which broke."""
+        broken = self._episodes.running & ~_finite(result) & ~plan.resets
+        self._episodes.end(broken, EpisodeEvent.REASON_ERROR, plan.stamp_ns, abort=True)
+        return result.valid & self._episodes.running & ~plan.resets, broken
+
+    def _reset_some(self, plan: _Plan, observation: Observation) -> None:
+        """Reset what the plan resets; what is then shown becomes the current observation."""
+        if plan.resets.any():
+            self._episodes.end(plan.resets, EpisodeEvent.REASON_RESET, plan.stamp_ns)
             with self._environment_errors():
-                observation = self.environment.reset(mask, seeds)
-            valid &= ~mask
-        self._current = observation
-        stamp = self._stamp_ns = self._clock()
-        self._last_step_id = command.step_id
-        aborted = self._aborted() if mask is None else self._aborted() & ~mask
-        success = np.where(valid, result.success_probability, 0).astype(np.float32)
-        truth = np.where(valid[:, None], result.ground_truth, self._truth()).astype(np.float32)
-        reply = replace(
-            self._reply(stamp, command.with_image), terminated=result.terminated & valid,
-            truncated=result.truncated & valid | aborted, success_probability=success, uncertainty=result.uncertainty,
-            step_s=time.perf_counter() - started,
+                observation = self.environment.reset(plan.resets, plan.seeds)
+        self._current, self._stamp_ns, self._last_step_id = observation, self._clock(), plan.command.step_id
+
+    def _lockstep(self, plan: _Plan, result: StepResult, valid: BoolArray) -> LockStep:
+        assert self._current is not None
+        command, before, unknown = plan.command, plan.before, np.full(self.spec.num_envs, np.nan, np.float32)
+        return LockStep(
+            session=self.session, step_id=command.step_id, stamp_ns=plan.stamp_ns, next_stamp_ns=self._stamp_ns,
+            actions=plan.actions, states=before.state, next_states=self._current.state,
+            logprobs=unknown if command.logprobs is None else command.logprobs,
+            values=unknown if command.values is None else command.values, terminated=result.terminated & valid,
+            truncated=result.truncated & valid, valid=valid, episode_ids=before.episode_id,
+            episode_steps=before.episode_step,
+            policy_versions=np.full(self.spec.num_envs, command.policy_version, np.uint64),
+            success_probability=np.where(valid, result.success_probability, 0).astype(np.float32),
+            uncertainty=result.uncertainty,
+            ground_truth=np.where(valid[:, None], result.ground_truth, self._truth()).astype(np.float32),
+            source=self.spec.source,
         )
-        self._publish_observation(stamp, goals_changed=mask is not None and bool(mask.any()))
-        count = self.spec.num_envs
-        unknown = np.full(count, np.nan, np.float32)
-        self._sink.transition(
-            Transition(
-                stamp_ns=before_stamp, next_stamp_ns=stamp, step_id=command.step_id, actions=actions,
-                states=before.state, next_states=observation.state,
-                logprobs=unknown if command.logprobs is None else command.logprobs,
-                values=unknown if command.values is None else command.values, terminated=reply.terminated,
-                truncated=result.truncated & valid, valid=valid, episode_ids=before.episode_id,
-                episode_steps=before.episode_step, policy_versions=np.full(count, command.policy_version, np.uint64),
-                success_probability=success, uncertainty=result.uncertainty, ground_truth=truth,
-                source=self.spec.source,
-            )
+
+    def _answer(self, plan: _Plan, step: LockStep, step_s: float) -> Reply:
+        """Truncated here is also what was ended from outside, until it is reset."""
+        return replace(
+            self._reply(plan.command.with_image), terminated=step.terminated,
+            truncated=step.truncated | self._episodes.aborted & ~plan.resets,
+            success_probability=step.success_probability, uncertainty=step.uncertainty, step_s=step_s,
         )
-        self._note_progress(valid, reply, command.policy_version, stamp)
-        if mask is not None and mask.any():
-            assert seeds is not None
-            self._start_episodes(mask, seeds, stamp)
-        self._last_reply = reply
-        if broken.any():
-            self._last_reply = WireError(
-                ErrorCode.NAN_MODEL,
-                f"the model produced NaN in environments {np.flatnonzero(broken).tolist()} at step {command.step_id}; "
-                "their episodes are over, reset them",
-            )
-            raise self._last_reply
-        return reply
+
+    def _publish(self, plan: _Plan, step: LockStep) -> None:
+        self._publish_observation(goals_changed=bool(plan.resets.any()))
+        self._sink.transition(step)
+        self._episodes.advance(step, plan.command.policy_version)
+        if plan.seeds is not None and self._current is not None:
+            self._episodes.start(plan.resets, self._current.episode_id, plan.seeds, self._stamp_ns)
 
     def check_actions(self, flat: FloatArray) -> FloatArray:
         """Return actions as float32 (N, A). Raises WireError: BAD_SHAPE, NAN_INPUT, OUT_OF_RANGE."""
@@ -279,24 +293,10 @@ class LockstepEnvironment:
         try:
             yield
         except Exception as error:
-            self._abort(np.ones(self.spec.num_envs, bool), EpisodeEvent.REASON_ERROR, self._stamp_ns)
-            for slot in self._slots:
-                slot.aborted = True
+            self._episodes.abort_all(EpisodeEvent.REASON_ERROR, self._stamp_ns)
             code = ErrorCode.NAN_MODEL if isinstance(error, FloatingPointError) else ErrorCode.INTERNAL
             text = f"the environment failed: {type(error).__name__}: {error}; all episodes are over, reset them"
             raise WireError(code, text) from error
-
-    def _running(self) -> BoolArray:
-        return np.array([slot.running for slot in self._slots])
-
-    def _aborted(self) -> BoolArray:
-        return np.array([slot.aborted for slot in self._slots])
-
-    def _abort(self, mask: BoolArray, reason: int, stamp: int) -> None:
-        """End running episodes from outside: their environments do nothing valid until they are reset."""
-        for i in np.flatnonzero(mask & self._running()):
-            self._end(int(i), EpisodeEvent.OUTCOME_UNKNOWN, reason, stamp)
-            self._slots[i].aborted = True
 
     def _gate(self) -> None:
         self.check_estop()
@@ -311,24 +311,23 @@ class LockstepEnvironment:
             raise WireError(ErrorCode.BAD_SHAPE, f"{len(seeds)} seeds for {self.spec.num_envs} environments")
         return seeds
 
-    def _reply(self, stamp: int, with_image: bool) -> Reply:
+    def _reply(self, with_image: bool) -> Reply:
         assert self._current is not None
         count = self.spec.num_envs
         none = np.zeros(count, bool)
         zeros = np.zeros(count, np.float32)
         return Reply(
-            session=self.session, step_id=self._last_step_id, stamp_ns=stamp,
+            session=self.session, step_id=self._last_step_id, stamp_ns=self._stamp_ns,
             images=self._current.image if with_image else None, states=self._current.state, terminated=none,
             truncated=none, episode_ids=self._current.episode_id, success_probability=zeros, uncertainty=zeros,
         )
 
-    def _reset_transition(self, stamp: int) -> Transition:
+    def _reset_lockstep(self) -> LockStep:
         assert self._current is not None
-        count = self.spec.num_envs
+        count, stamp, current = self.spec.num_envs, self._stamp_ns, self._current
         zeros, none, unknown = np.zeros(count, np.float32), np.zeros(count, bool), np.full(count, np.nan, np.float32)
-        current = self._current
-        return Transition(
-            stamp_ns=stamp, next_stamp_ns=stamp, step_id=self._last_step_id,
+        return LockStep(
+            session=self.session, step_id=self._last_step_id, stamp_ns=stamp, next_stamp_ns=stamp,
             actions=np.zeros((count, self.spec.action_dim), np.float32), states=current.state,
             next_states=current.state, logprobs=unknown, values=unknown, terminated=none, truncated=none, valid=none,
             episode_ids=current.episode_id, episode_steps=current.episode_step,
@@ -342,54 +341,25 @@ class LockstepEnvironment:
         truth: FloatArray | None = getattr(self.environment, "ground_truth", None)
         return np.full(shape, np.nan, np.float32) if truth is None else truth
 
-    def _publish_observation(self, stamp: int, *, goals_changed: bool) -> None:
+    def _publish_observation(self, *, goals_changed: bool) -> None:
         assert self._current is not None
-        self._sink.image(self._current.image, stamp)
+        self._sink.image(self._current.image, self._stamp_ns)
         if goals_changed:
             with self._environment_errors():
                 goals = self.environment.goals()
-            images, found = (None, np.zeros(self.spec.num_envs, bool)) if goals is None else goals
-            self._sink.goals(Goals(stamp, images, found, self._current.episode_id))
-
-    def _start_episodes(self, mask: BoolArray, seeds: UInt64Array, stamp: int) -> None:
-        assert self._current is not None
-        for i in np.flatnonzero(mask):
-            self._slots[i] = _Slot(episode_id=int(self._current.episode_id[i]), seed=int(seeds[i]), running=True)
-            self._note(int(i), EpisodeEvent.KIND_START, EpisodeEvent.OUTCOME_UNKNOWN, EpisodeEvent.REASON_NONE, stamp)
-
-    def _note_progress(self, valid: BoolArray, reply: Reply, version: int, stamp: int) -> None:
-        for i in np.flatnonzero(valid):
-            slot = self._slots[i]
-            slot.version_first = slot.version_first if slot.length else version
-            slot.version_last = version
-            slot.length += 1
-            if reply.terminated[i]:
-                self._end(int(i), EpisodeEvent.OUTCOME_SUCCESS, EpisodeEvent.REASON_TERMINAL, stamp)
-            elif reply.truncated[i]:
-                at_limit = slot.length >= self.spec.max_episode_steps
-                reason = EpisodeEvent.REASON_TIME_LIMIT if at_limit else EpisodeEvent.REASON_UNCERTAINTY
-                self._end(int(i), EpisodeEvent.OUTCOME_FAILURE, reason, stamp)
-
-    def _end_episodes(self, mask: BoolArray, reason: int, stamp: int) -> None:
-        for i in np.flatnonzero(mask):
-            if self._slots[i].running:
-                self._end(int(i), EpisodeEvent.OUTCOME_UNKNOWN, reason, stamp)
-
-    def _end(self, i: int, outcome: int, reason: int, stamp: int) -> None:
-        self._slots[i].running = False
-        self._note(i, EpisodeEvent.KIND_END, outcome, reason, stamp)
-
-    def _note(self, i: int, kind: int, outcome: int, reason: int, stamp: int) -> None:
-        slot = self._slots[i]
-        note = EpisodeNote(
-            stamp_ns=stamp, kind=kind, env_index=i, episode_id=slot.episode_id, seed=slot.seed,
-            behaviour=self._behaviour, length=slot.length, outcome=outcome, reason=reason,
-            policy_version_first=slot.version_first, policy_version_last=slot.version_last,
-        )
-        self._sink.episode(note)
+            images, known = (None, np.zeros(self.spec.num_envs, bool)) if goals is None else goals
+            self._sink.goals(Goals(self._stamp_ns, images, known, self._current.episode_id, self.session))
 
 
 def _finite(result: StepResult) -> BoolArray:
     """(N,): state and success probability are numbers."""
     finite: BoolArray = np.isfinite(result.observation.state).all(1) & np.isfinite(result.success_probability)
     return finite
+
+
+def _nan_error(broken: BoolArray, step_id: int) -> WireError:
+    return WireError(
+        ErrorCode.NAN_MODEL,
+        f"the model produced NaN in environments {np.flatnonzero(broken).tolist()} at step {step_id}; their episodes "
+        "are over, reset them",
+    )

@@ -16,6 +16,7 @@ from wm_msgs.srv import SetRubric
 from wm_nodes.config.load import ConfigError
 from wm_nodes.config.schema import JudgeConfig, RunConfig
 from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.named_files import FileKind, shown
 from wm_nodes.judge.agent.contract import pause_reason
 from wm_nodes.judge.agent.types import GATED, Status
@@ -27,7 +28,6 @@ from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param, named_files
-from wm_nodes.ros.wire import WireError
 from wm_nodes.ros.worker import Work
 
 PARAMS = (
@@ -62,7 +62,7 @@ class JudgeServices:
         for card in self.judge.cards:
             node.get_logger().info(card)
         self._verdicts = node.publish_on("reward/verdict")
-        node.serve(SetRubric, "reward/set_rubric", self._on_set_rubric)
+        node.serve(SetRubric, "reward/set_rubric", self._on_set_rubric, counted="refused_rubrics")
         self._turn = threading.Lock()
         self._action = WorkerAction(node, JudgeClips, "reward/judge_clips", self._judge_folder)
         self.judge.refresh_health()
@@ -123,14 +123,7 @@ class JudgeServices:
         return message
 
     def pause(self, verdicts: Sequence[Verdict]) -> str:
-        """Why training must pause after a round's verdicts, told to the diagnostics too; "" where it may go on. A round
-        that another judge than the first had to judge is a warning there.
-        """
-        if fallen_back := self.judge.fallen_back:
-            self._node.get_logger().warning(fallen_back)
-            self._node.diagnostics.set_condition("judge_fallback", diagnostics.WARN, fallen_back)
-        else:
-            self._node.diagnostics.clear_condition("judge_fallback")
+        """Why training must pause after a round's verdicts, told to the diagnostics too; "" where it may go on."""
         reason = pause_reason(verdicts)
         if reason:
             self._node.get_logger().error(reason)
@@ -159,17 +152,13 @@ class JudgeServices:
         if health.available:
             board.clear_condition("judge")
         else:
-            board.set_condition("judge", diagnostics.WARN, f"judge {judge.judge_ids[0]}: {health.reason}")
+            board.set_condition("judge", diagnostics.WARN, f"judge {judge.judge_id}: {health.reason}")
 
     def _on_set_rubric(self, request: SetRubric.Request, response: SetRubric.Response) -> SetRubric.Response:
-        try:
-            if request.pack and (self._busy() or self._action.busy):
-                raise WireError(ErrorCode.BUSY, "clips are being judged by the present rubric; set another one later")
-            if request.pack:
-                self._set_rubric(request.pack)
-        except WireError as error:
-            self._node.diagnostics.count("refused_rubrics", text=f"reward/set_rubric refused: {error}")
-            return convert.fill_error(response, error)
+        if request.pack and (self._busy() or self._action.busy):
+            raise WireError(ErrorCode.BUSY, "clips are being judged by the present rubric; set another one later")
+        if request.pack:
+            self._set_rubric(request.pack)
         response.pack, response.version = self.judge.pack, self.judge.rubric.version
         return response
 
@@ -197,9 +186,8 @@ class JudgeServices:
     def _read(self, path: Path, kind: FileKind) -> bytes:
         return self._files.read(str(path), kind)
 
-    def _judge_folder(self, work: Work) -> JudgeClips.Result:
+    def _judge_folder(self, work: Work, result: JudgeClips.Result) -> None:
         goal: JudgeClips.Goal = work.request
-        result = JudgeClips.Result(termination_reason=JudgeClips.Result.FINISHED)
         progress = JudgeClips.Feedback(stages_passed=[0] * len(GATED))
         verdicts, messages = list[Verdict](), list[ClipVerdict]()
         at_once = max(AT_ONCE, self.judge.settings.concurrency)
@@ -214,11 +202,8 @@ class JudgeServices:
                 )
                 verdicts += judged
                 messages += round_messages
-        except (ValueError, OSError) as error:
-            result.termination_reason, result.message = JudgeClips.Result.FAILED, str(error)
-            self._node.say_failed_goal(f"{shown(goal.folder)} not judged: {error}")
-        result.verdicts, result.pause_reason = messages, pause_reason(verdicts)
-        return result
+        finally:
+            result.verdicts, result.pause_reason = messages, pause_reason(verdicts)
 
 
 def deadline_of(seconds: float) -> float | None:

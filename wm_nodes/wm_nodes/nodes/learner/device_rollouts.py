@@ -6,11 +6,12 @@ They do not pass the topics: env/image, env/transition and reward stay silent, a
 from collections.abc import Callable
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.lockstep import DroppedTransitions
 from wm_nodes.core.types import Environment
 from wm_nodes.nodes.factories import make_reward
 from wm_nodes.policy_rl.device_rollout import DeviceCollector
 from wm_nodes.policy_rl.rollouts import TensorRollout
-from wm_nodes.policy_rl.training_run import DroppedTransitions, PolicyTraining
+from wm_nodes.policy_rl.training_run import PolicyTraining
 from wm_nodes.ros.clients import Check
 from wm_nodes.world_model import DeviceEnvironment, ImaginedEnvironment
 

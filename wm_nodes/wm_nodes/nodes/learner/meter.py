@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.types import Environment
 from wm_nodes.nodes.environment.remote_environment import RemoteEnvironment
 from wm_nodes.nodes.factories import existing
@@ -11,7 +12,7 @@ from wm_nodes.policy_rl.exploit_meter import ExploitMeter, ExploitReading, make_
 from wm_nodes.policy_rl.training_run import PolicyTraining
 from wm_nodes.ros.clients import Check, RosEnvironmentClient
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.wire import PeerLost, WireError
+from wm_nodes.ros.wire import PeerLost
 
 SIMULATOR, NAME = "sim", "exploit_meter"
 """Namespace of the simulator, as the evaluation node's; what its episodes there and the readings are called."""

@@ -11,18 +11,19 @@ from rclpy.action import ActionClient
 from wm_msgs.action import Replay
 from wm_msgs.action import Rollout as RolloutAction
 from wm_msgs.msg import ErrorCode
+from wm_nodes.core.errors import WireError
+from wm_nodes.core.lockstep import DroppedTransitions
 from wm_nodes.core.named_files import NamedFiles
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Rollout
 from wm_nodes.nodes.factories import existing
-from wm_nodes.nodes.learner.replay_assembler import ReplayAssembler
 from wm_nodes.nodes.learner.rollout_assembler import RolloutAssembler
 from wm_nodes.policy_rl.rollouts import TensorRollout
-from wm_nodes.policy_rl.training_run import DroppedTransitions, Progress
+from wm_nodes.policy_rl.training_run import Progress
 from wm_nodes.recording import BagReport, read_rollouts, topics
 from wm_nodes.ros.clients import Check, run_goal, same_process
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.wire import PeerLost, WireError
+from wm_nodes.ros.wire import PeerLost
 from wm_nodes.ros.worker import Work
 
 RETRY_S = 0.5
@@ -167,7 +168,7 @@ class ReplayedRollouts:
     """
 
     def __init__(
-        self, node: ManagedNode, check: Check, progress: Progress, assembler: ReplayAssembler, client: ActionClient,
+        self, node: ManagedNode, check: Check, progress: Progress, assembler: RolloutAssembler, client: ActionClient,
         uris: Sequence[str], *, num_steps: int,
     ) -> None:
         self._node, self._check, self._progress, self._assembler = node, check, progress, assembler
@@ -186,7 +187,7 @@ class ReplayedRollouts:
             self._check()
             if self._error is not None:
                 raise self._error
-            taken = self._assembler.take(float(self._node.param("join_timeout_s")))
+            taken = self._assembler.take_replayed(float(self._node.param("join_timeout_s")))
             if taken is None:
                 if self._over():
                     self._progress.dropped_stale += stale

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_msgs.msg import PolicyVersion
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.run_lock import RunLock
 from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.ros import convert
@@ -15,7 +16,7 @@ from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import COMMON, Param, read_parameters
 from wm_nodes.ros.spin import run_node
-from wm_nodes.ros.wire import PeerLost, WireError
+from wm_nodes.ros.wire import PeerLost
 from wm_nodes.ros.worker import Work
 from wm_nodes.training.ranks import Ranks, join
 from wm_nodes.training.run_folder import TrainingRun
@@ -57,7 +58,6 @@ class TrainingNode(ManagedNode):
     def serve_training(self, run: TrainingRun, action_type: type[Any], action: str, version_topic: str) -> None:
         """Serve the action and announce versions, until cleanup."""
         self._run = run
-        self._result_type = action_type.Result
         self._versions = self.publish_on(version_topic)
         self._action = WorkerAction(self, action_type, action, self._train_goal, self.fill)
 
@@ -90,10 +90,9 @@ class TrainingNode(ManagedNode):
         """Publish every version that is acted with now. Raises OSError."""
         self.announce()
 
-    def _train_goal(self, work: Work) -> Any:
-        reasons, run = self._result_type, self._run
+    def _train_goal(self, work: Work, result: Any) -> None:
+        reasons, run = type(result), self._run
         assert run is not None  # serve_training sets it
-        result = reasons(termination_reason=reasons.FINISHED)
         try:
             self.announce_versions()  # again: others may have heard of another one since, or its files were not written
             self.train(work, result)
@@ -109,7 +108,6 @@ class TrainingNode(ManagedNode):
             self.get_logger().warning(f"training ended: {result.message}")
         else:
             self.get_logger().info(f"training ended after update {run.updates}")
-        return self.fill(result)
 
 
 def run_learner(

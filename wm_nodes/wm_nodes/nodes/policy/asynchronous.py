@@ -7,32 +7,37 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from sensor_msgs.msg import Image
 
 from wm_msgs.msg import ErrorCode, TransitionBatch
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import FloatArray, UInt8Array
-from wm_nodes.nodes.learner.rollout_assembler import ImageCache
 from wm_nodes.nodes.policy.weights import PolicyHolder
 from wm_nodes.policy_rl.image_policy import PolicyOutput
-from wm_nodes.ros import convert, diagnostics
+from wm_nodes.recording.messages import floats, images_of, time_ns
+from wm_nodes.ros import diagnostics
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.sequence_numbers import MAX_NUMBER
-from wm_nodes.ros.wire import WireError
 
 CAPACITY = 8
 
 
 @dataclass(frozen=True)
 class SyncedObservation:
-    """One observation as the topics brought it. images: (N, H, W, 3). states: (N, S). step_id: of the next step."""
+    """One observation as the topics brought it."""
 
     stamp_ns: int
+    """When it was made."""
     step_id: int
+    """Of the next step."""
     images: UInt8Array
+    """(N, H, W, 3)."""
     states: FloatArray
+    """(N, S)."""
 
 
 class AsynchronousPolicy:
@@ -56,7 +61,7 @@ class AsynchronousPolicy:
         self._stopped, self._stops = stopped, 0
         self.spec: EnvironmentSpec | None = None
         self._changed = threading.Condition()
-        self._images = ImageCache(CAPACITY)
+        self._images: dict[int, UInt8Array] = {}
         self._states: dict[int, tuple[int, FloatArray]] = {}
         self._next: SyncedObservation | None = None
         self._thread: threading.Thread | None = None
@@ -95,24 +100,21 @@ class AsynchronousPolicy:
     def _on_image(self, message: Image) -> None:
         if self.spec is None:
             return
-        images = convert.images_of(message, self.spec)
-        stamp_ns = convert.time_ns(message.header.stamp)
+        images, stamp_ns = images_of(message, self.spec), time_ns(message.header.stamp)
         with self._changed:
-            self._images.put(stamp_ns, images)
+            _keep(self._images, stamp_ns, images)
             self._join(stamp_ns)
 
     def _on_transition(self, message: TransitionBatch) -> None:
         if self.spec is None:
             return
         shape = (self.spec.num_envs, self.spec.state_dim)
-        states = convert.floats(message.next_state, shape, "next_state")
+        states = floats(message.next_state, shape, "next_state")
         if message.step_id == MAX_NUMBER:
             raise WireError(ErrorCode.OUT_OF_RANGE, f"no step comes after step_id {message.step_id}; count from 0")
-        stamp_ns = convert.time_ns(message.next_stamp)
+        stamp_ns = time_ns(message.next_stamp)
         with self._changed:
-            self._states[stamp_ns] = message.step_id + 1, states
-            while len(self._states) > CAPACITY:
-                del self._states[next(iter(self._states))]
+            _keep(self._states, stamp_ns, (message.step_id + 1, states))
             self._join(stamp_ns)
 
     def _join(self, stamp_ns: int) -> None:
@@ -155,3 +157,10 @@ class AsynchronousPolicy:
         with self._outgoing:
             if stops == self._stops:
                 self._publish(observation.stamp_ns, observation.step_id, output, version, infer_s)
+
+
+def _keep(kept: dict[int, Any], stamp_ns: int, value: object) -> None:
+    """Put a value among the newest CAPACITY."""
+    kept[stamp_ns] = value
+    while len(kept) > CAPACITY:
+        del kept[next(iter(kept))]

@@ -4,11 +4,12 @@ import threading
 
 from wm_msgs.msg import ErrorCode, PolicyVersion
 from wm_nodes.core.device import explain_memory
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.named_files import WEIGHTS, FileRefused, NamedFiles, shown
 from wm_nodes.core.types import FloatArray, UInt8Array
+from wm_nodes.nodes.factories import existing
 from wm_nodes.policy_rl.image_policy import ImagePolicy, PolicyOutput
 from wm_nodes.ros import convert
-from wm_nodes.ros.wire import WireError
 from wm_nodes.training.weights import WeightsError, arch_hash, load_weights
 
 
@@ -78,12 +79,23 @@ class PolicyHolder:
         return read_weights(message.uri, files)
 
 
+def load_initial(policy: ImagePolicy, name: str) -> None:
+    """Load the weights file that the parameter initial_policy names, if any. Raises ValueError: missing, or foreign."""
+    if not name:
+        return
+    path = existing(name, "initial_policy")
+    try:
+        load_weights(policy, path.read_bytes())
+    except WeightsError as error:
+        raise ValueError(f"initial_policy {path}: {error}") from None
+
+
 def read_weights(uri: str, files: NamedFiles) -> bytes:
     """Read a weights file that a message names. Raises WireError: OUT_OF_RANGE outside of the folders, IO_ERROR."""
     try:
         return files.read(uri, WEIGHTS)
     except FileRefused as error:
-        raise convert.file_error(error) from None
+        raise convert.refusal_of(error) from None
     except OSError as error:
         text = f"cannot read weights {shown(uri)}: {error.strerror}; name a file that is in the run folder"
         raise WireError(ErrorCode.IO_ERROR, text) from None

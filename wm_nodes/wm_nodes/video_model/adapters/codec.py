@@ -17,14 +17,11 @@ class VideoCodec:
 
     Args:
         device: where it computes. offload: it rests on the CPU and visits the device for each call.
-        clips_per_call: of the VAE, whose memory grows with them.
     """
 
-    def __init__(
-        self, vae: Any, *, device: str | torch.device = "cpu", offload: bool = False, clips_per_call: int = 1
-    ) -> None:
+    def __init__(self, vae: Any, *, device: str | torch.device = "cpu", offload: bool = False) -> None:
         self.vae = vae.requires_grad_(False).eval()
-        self.device, self.offload, self.clips_per_call = torch.device(device), offload, clips_per_call
+        self.device, self.offload = torch.device(device), offload
         self.frames_per_latent = int(vae.config.scale_factor_temporal)
         self.pixels_per_cell = int(vae.config.scale_factor_spatial)
         self.channels = int(vae.config.z_dim)
@@ -47,7 +44,7 @@ class VideoCodec:
         def part(some: Tensor) -> Tensor:
             return self._encode(some.to(self.device).permute(0, 4, 1, 2, 3).float() / 127.5 - 1)
 
-        return self._in_calls(part, frames)
+        return self._one_by_one(part, frames)
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> Tensor:
@@ -57,7 +54,7 @@ class VideoCodec:
             pixels = ((self._decode(some) + 1) * 127.5).round().clamp(0, 255)
             return pixels.to(torch.uint8).permute(0, 2, 3, 4, 1).contiguous()
 
-        return self._in_calls(part, latents)
+        return self._one_by_one(part, latents)
 
     @torch.no_grad()
     def continuation(self, latents: Tensor, num_frames: int) -> Tensor:
@@ -72,10 +69,10 @@ class VideoCodec:
             rest = self._encode(torch.cat([pixels, grey], 2))
         return torch.cat([latents.to(rest), rest[:, :, latents.shape[2] :]], 2)
 
-    def _in_calls(self, function: Callable[[Tensor], Tensor], clips: Tensor) -> Tensor:
-        """The results for clips_per_call clips at a time, one below the other."""
+    def _one_by_one(self, function: Callable[[Tensor], Tensor], clips: Tensor) -> Tensor:
+        """The results of one clip at a time, since the VAE's memory grows with them."""
         with self._present():
-            return torch.cat([function(some) for some in torch.split(clips, self.clips_per_call)])  # type: ignore[no-untyped-call]
+            return torch.cat([function(clip) for clip in torch.split(clips, 1)])  # type: ignore[no-untyped-call]
 
     def _encode(self, pixels: Tensor) -> Tensor:
         latents: Tensor = self.vae.encode(pixels.to(self.vae.dtype)).latent_dist.mode().float()

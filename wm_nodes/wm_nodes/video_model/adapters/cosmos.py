@@ -12,7 +12,6 @@ training ends at sigma = 80, t = 0.988; Predict2.5's sampler starts at 0.995. Ou
 Given frames are clean latents in place, marked in a mask channel and given a time near 0 (CLEAN_TIME).
 """
 
-from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -38,11 +37,10 @@ class CosmosVelocity(PublicVelocity):
 
     def __init__(
         self, transformer: nn.Module, null_text: Tensor | None = None, *, version: CosmosVersion = "2.5",
-        fps: int | None = None, action_dim: int = 0, autocast: torch.dtype | None = None,
+        fps: int | None = None,
     ) -> None:
         config: Any = transformer.config
-        width = 3 * config.num_attention_heads * config.attention_head_dim
-        super().__init__(transformer, null_text, action_dim=action_dim, action_width=width, autocast=autocast)
+        super().__init__(transformer, null_text)
         if config.img_context_dim_in:
             raise ValueError("this Cosmos model wants image context (Transfer2.5), which is not supported")
         self.version, self.fps = version, fps
@@ -68,14 +66,12 @@ class CosmosVelocity(PublicVelocity):
             raise ValueError(f"this Cosmos model has no mask channel and takes no given frames, got {K}")
         times = self._frame_times(t, x, K, CLEAN_TIME[self.version])
         text = self._text(condition, drop, dtype)
-        embedder = self.transformer.time_embed.t_embedder
-        with self._precision(x.device), self._steer(embedder, condition, drop, 1, x):
-            out = self.transformer(
-                hidden_states=with_conditioning(x, condition.frames).to(dtype),
-                timestep=times.to(dtype if self.version == "2" else torch.float32)[:, None, :, None, None],
-                encoder_hidden_states=text, condition_mask=self._extra_channels(x, K, dtype), fps=self.fps,
-                return_dict=False,
-            )[0]
+        out = self.transformer(
+            hidden_states=with_conditioning(x, condition.frames).to(dtype),
+            timestep=times.to(dtype if self.version == "2" else torch.float32)[:, None, :, None, None],
+            encoder_hidden_states=text, condition_mask=self._extra_channels(x, K, dtype), fps=self.fps,
+            return_dict=False,
+        )[0]
         velocity: Tensor = out.float()
         return velocity
 
@@ -92,11 +88,6 @@ class CosmosVelocity(PublicVelocity):
             self.null_text = projection(self.null_text.to(projection[0].weight)).detach()
         projected: Tensor = projection(text.to(projection[0].weight))
         return projected
-
-    def save(self, folder: Path) -> None:
-        self.transformer.register_to_config(concat_padding_mask=self.has_padding)
-        super().save(folder)
-        self.transformer.register_to_config(concat_padding_mask=False)
 
     def _extra_channels(self, x: Tensor, num_conditioning: int, dtype: torch.dtype) -> Tensor | None:
         """Mask of the given frames, and padding (none), as far as the network has inputs for them."""

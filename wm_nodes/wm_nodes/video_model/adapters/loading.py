@@ -26,38 +26,34 @@ COSMOS2_FPS = 16
 
 @dataclass(frozen=True)
 class LoadSettings:
-    """dtype: of the weights of network and text encoder; vae_dtype: of the VAE, whose pictures suffer from less than
-    float32. autocast: of the network's arithmetic (see PublicVelocity); None: that of the weights.
-    device: where everything computes; text_device: the text encoder, where elsewhere. offload: VAE and text encoder
-    rest on the CPU and visit the device. tiling: the VAE works through large pictures in tiles. vae_clips: clips per
-    call of the VAE. gradient_checkpointing: see PublicVelocity. text: load the text encoder;
-    without it, Conditions bring text embedded elsewhere and guidance needs null_text. negative_prompt: what the
-    unconditional branch is told. action_dim: see PublicVelocity.
-    """
+    """How a public model is loaded."""
 
     dtype: Precision = "float32"
-    vae_dtype: Precision = "float32"
-    autocast: Precision | None = None
+    """Of the weights of network and text encoder; the VAE's are float32, since its pictures suffer from less."""
     device: str = "cpu"
-    text_device: str | None = None
+    """Where everything computes."""
     offload: bool = False
-    tiling: bool = False
-    vae_clips: int = 1
+    """VAE and text encoder rest on the CPU and visit the device."""
     gradient_checkpointing: bool = False
-    text: bool = True
+    """Trade a second forward pass for the activations' memory."""
     max_tokens: int = MAX_TOKENS
+    """Of an embedded prompt."""
     negative_prompt: str = ""
-    action_dim: int = 0
+    """What the unconditional branch sees."""
 
 
 @dataclass(frozen=True)
 class PublicVideoModel:
-    """velocity: the network, trainable. shift: RolloutSettings.shift of the model's own scheduler."""
+    """Everything that GRPO needs of a public model."""
 
     velocity: PublicVelocity
+    """The network, trainable."""
     codec: VideoCodec
-    text: TextEncoder | None
+    """Camera frames to latents and back."""
+    text: TextEncoder
+    """Of prompts."""
     shift: float
+    """RolloutConfig.shift of the model's own scheduler."""
 
     def condition(self, frames: Tensor, prompts: list[str], latent_frames: int) -> Condition:
         """Return what videos of `latent_frames` latent frames are made from, without actions, where the network is.
@@ -68,23 +64,16 @@ class PublicVideoModel:
             frames: given camera frames, uint8 (B, N, H, W, 3). prompts: one each.
 
         Raises:
-            ValueError: there is no text encoder, or as VideoCodec.encode.
+            ValueError: as VideoCodec.encode.
         """
-        if self.text is None:
-            raise ValueError("there is no text encoder to embed a prompt with; load the folder with text=True")
         device = device_of(self.velocity)
         text = torch.cat([self.velocity.project_text(self.text.encode([p]).to(device)).float() for p in prompts])
         actions = torch.zeros(len(frames), latent_frames - 1, 0)
         return Condition(self.codec.encode(frames), actions, text).to(device)
 
 
-def load_public_model(
-    folder: Path | str, settings: LoadSettings | None = None, *, null_text: Tensor | None = None
-) -> PublicVideoModel:
+def load_public_model(folder: Path | str, settings: LoadSettings | None = None) -> PublicVideoModel:
     """Load a Wan or Cosmos-Predict folder; nothing is fetched and nothing in it is executed.
-
-    Args:
-        null_text: embedded negative prompt (L, E), in place of settings.negative_prompt.
 
     Raises:
         ModelFolderError: the folder is missing, incomplete or of another kind; names the path and the remedy.
@@ -96,13 +85,10 @@ def load_public_model(
     if files.pipeline not in (*WAN, *COSMOS):
         raise ModelFolderError(f"{files.folder} holds a {files.pipeline}; supported are {', '.join((*WAN, *COSMOS))}")
     dtype = getattr(torch, settings.dtype)
-    vae = files.model("vae", "AutoencoderKLWan", getattr(torch, settings.vae_dtype))
-    if settings.tiling:
-        vae.enable_tiling()
-    codec = VideoCodec(vae, device=settings.device, offload=settings.offload, clips_per_call=settings.vae_clips)
+    vae = files.model("vae", "AutoencoderKLWan", torch.float32)
+    codec = VideoCodec(vae, device=settings.device, offload=settings.offload)
     text = _text(files, settings, dtype)
-    if null_text is None and text is not None:
-        null_text = text.encode([settings.negative_prompt])[0]
+    null_text = text.encode([settings.negative_prompt])[0]
     scheduler = files.scheduler()
     try:
         if files.pipeline in WAN:
@@ -119,19 +105,17 @@ def load_public_model(
     return PublicVideoModel(velocity, codec, text, _shift(scheduler))
 
 
-def _text(files: ModelFolder, settings: LoadSettings, dtype: torch.dtype) -> TextEncoder | None:
-    if not settings.text:
-        return None
+def _text(files: ModelFolder, settings: LoadSettings, dtype: torch.dtype) -> TextEncoder:
     version = COSMOS.get(files.pipeline)
     style: TextStyle = "wan" if version is None else "cosmos2" if version == "2" else "cosmos2.5"
     return TextEncoder(
-        files.text_encoder(dtype), files.tokenizer(), style, device=settings.text_device or settings.device,
-        offload=settings.offload, max_tokens=settings.max_tokens,
+        files.text_encoder(dtype), files.tokenizer(), style, device=settings.device, offload=settings.offload,
+        max_tokens=settings.max_tokens,
     )
 
 
 def _wan(
-    files: ModelFolder, settings: LoadSettings, codec: VideoCodec, null_text: Tensor | None, scheduler: dict[str, Any]
+    files: ModelFolder, settings: LoadSettings, codec: VideoCodec, null_text: Tensor, scheduler: dict[str, Any]
 ) -> WanVelocity:
     dtype, name = getattr(torch, settings.dtype), "WanTransformer3DModel"
     transformer = files.model("transformer", name, dtype)
@@ -145,21 +129,15 @@ def _wan(
     return WanVelocity(
         transformer, null_text, frames=frames, continuation=codec.continuation, low_noise=low_noise,
         boundary=float(boundary or 0.0), time_scale=float(scheduler.get("num_train_timesteps", 1000)),
-        action_dim=settings.action_dim, autocast=_autocast(settings),
     )
 
 
-def _cosmos(files: ModelFolder, settings: LoadSettings, null_text: Tensor | None) -> CosmosVelocity:
+def _cosmos(files: ModelFolder, settings: LoadSettings, null_text: Tensor) -> CosmosVelocity:
     version = COSMOS[files.pipeline]
     return CosmosVelocity(
         files.model("transformer", "CosmosTransformer3DModel", getattr(torch, settings.dtype)), null_text,
-        version=version, fps=COSMOS2_FPS if version == "2" else None, action_dim=settings.action_dim,
-        autocast=_autocast(settings),
+        version=version, fps=COSMOS2_FPS if version == "2" else None,
     )
-
-
-def _autocast(settings: LoadSettings) -> torch.dtype | None:
-    return None if settings.autocast is None else getattr(torch, settings.autocast)
 
 
 def _shift(scheduler: dict[str, Any]) -> float:

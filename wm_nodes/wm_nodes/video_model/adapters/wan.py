@@ -43,11 +43,10 @@ class WanVelocity(PublicVelocity):
     def __init__(
         self, transformer: nn.Module, null_text: Tensor | None = None, *, frames: GivenFrames = "none",
         continuation: Continuation | None = None, low_noise: nn.Module | None = None, boundary: float = 0.0,
-        time_scale: float = 1000.0, action_dim: int = 0, autocast: torch.dtype | None = None,
+        time_scale: float = 1000.0,
     ) -> None:
         config: Any = transformer.config
-        width = config.num_attention_heads * config.attention_head_dim
-        super().__init__(transformer, null_text, action_dim=action_dim, action_width=width, autocast=autocast)
+        super().__init__(transformer, null_text)
         self.low_noise: Any = low_noise
         self.frames, self.boundary, self.time_scale = frames, boundary, time_scale
         self.patch: tuple[int, int, int] = tuple(config.patch_size)
@@ -83,17 +82,13 @@ class WanVelocity(PublicVelocity):
 
     def _velocity(self, network: Any, x: Tensor, t: Tensor, condition: Condition, drop: Tensor | None) -> Tensor:
         K, dtype = condition.num_conditioning, network.patch_embedding.weight.dtype
-        cells = num_cells(x, self.patch)
-        time_in_place = self.frames == "fused" or self.actions is not None
         times = self._frame_times(t, x, K if self.frames == "fused" else 0, clean=0.0)
-        token_times = times.repeat_interleave(cells, 1) if time_in_place else times[:, 0]
+        token_times = times.repeat_interleave(num_cells(x, self.patch), 1) if self.frames == "fused" else times[:, 0]
         text = self._text(condition, drop, dtype)
-        embedder = network.condition_embedder.time_embedder
-        with self._precision(x.device), self._steer(embedder, condition, drop, cells, x):
-            out = network(
-                hidden_states=self._inputs(x, t, condition).to(dtype), timestep=(token_times * self.time_scale).float(),
-                encoder_hidden_states=text, return_dict=False,
-            )[0]
+        out = network(
+            hidden_states=self._inputs(x, t, condition).to(dtype), timestep=(token_times * self.time_scale).float(),
+            encoder_hidden_states=text, return_dict=False,
+        )[0]
         velocity: Tensor = out.float()
         return velocity
 

@@ -1,4 +1,4 @@
-"""Train the judge's position probe on recorded images. Shapes: B images, P positions (PROBE_NAMES)."""
+"""Train the judge's position probe on recorded images. Shapes: B images, P positions."""
 
 from pathlib import Path
 
@@ -37,7 +37,7 @@ def train_position_probe(
     if not len(frames):
         raise ValueError("no recorded frame has ground truth; the judge's probe needs simulator episodes")
     with initial_weights(seed, "position_probe_init"):
-        probe = PositionProbe(height, width)
+        probe = PositionProbe(height, width, truth.shape[-1])
     mean, std = position_statistics(truth[frames])
     probe.mean.copy_(torch.from_numpy(mean))
     probe.std.copy_(torch.from_numpy(std))

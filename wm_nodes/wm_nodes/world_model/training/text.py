@@ -95,7 +95,7 @@ def _roll_out(
 
 def demonstrators() -> tuple[str, ...]:
     """Behaviours without noise. Golden trajectories must have one best future: the mean of many is blurred."""
-    return tuple(sorted({get_task(name).demonstrator for name in task_names()}))
+    return tuple(sorted({get_task(name).model.demonstrator for name in task_names()}))
 
 
 def golden_rows(episodes: EpisodeArrays) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
@@ -104,7 +104,7 @@ def golden_rows(episodes: EpisodeArrays) -> np.ndarray[tuple[int, int], np.dtype
     for episode, behaviour in enumerate(episodes.behaviours):
         for task, name in enumerate(episodes.tasks):
             wins = np.flatnonzero(episodes.success[episode, :, task] & labelled[episode, task])
-            if len(wins) and wins[0] > 0 and behaviour == get_task(name).demonstrator:
+            if len(wins) and wins[0] > 0 and behaviour == get_task(name).model.demonstrator:
                 rows.append((episode, task, min(int(wins[0]) + STEPS_AFTER_SUCCESS, int(episodes.lengths[episode]))))
     return np.array(rows, np.int64).reshape(-1, 3)
 

@@ -9,16 +9,16 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from wm_nodes.config.schema import RunConfig, TokenizerConfig
-from wm_nodes.config.tasks import get_task
 from wm_nodes.core.device import compute_device
 from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
 from wm_nodes.core.types import FloatArray
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.background import BackgroundBatches
 from wm_nodes.training.loop import TrainingLoop
+from wm_nodes.world_model.positions import probe_targets
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.quantizer import entropy_loss
-from wm_nodes.world_model.tokenizer import PROBE_NAMES, Tokenizer
+from wm_nodes.world_model.tokenizer import Tokenizer
 
 LATENT_NOISE = 0.1
 """Standard deviation of the noise on continuous latents while training; their own is 1."""
@@ -93,17 +93,6 @@ def foreground_weight(pixels_B3HW: Tensor, median_3HW: Tensor, settings: Tokeniz
         background = F.avg_pool2d(pixels_B3HW, side, stride=1, padding=side // 2, count_include_pad=False)
     contrast = (pixels_B3HW - background).abs().amax(1, keepdim=True) / FOREGROUND_CONTRAST
     return 1 + settings.foreground_weight * contrast.clamp(max=1)
-
-
-def probe_targets(ground_truth: FloatArray, task: str) -> FloatArray:
-    """The values of PROBE_NAMES (..., P), in m, out of a task's ground truth; NaN where the task has no such value, or
-    does not show its goal."""
-    what = get_task(task)
-    names = [name.replace("cube", "object") for name in what.ground_truth_names]
-    known = [name in names and (what.shows_goal or not name.startswith("goal")) for name in PROBE_NAMES]
-    unknown = np.full(ground_truth.shape[:-1], np.nan, np.float32)
-    columns = [ground_truth[..., names.index(name)] if k else unknown for name, k in zip(PROBE_NAMES, known)]
-    return np.stack(columns, -1)
 
 
 def episode_targets(episodes: EpisodeArrays) -> FloatArray:

@@ -15,12 +15,13 @@ import numpy as np
 from rich.table import Table
 
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.config.tasks import get_task, parts_of
+from wm_nodes.config.tasks import parts_of
 from wm_nodes.core.statistics import newcombe_difference, wilson_of_share
 from wm_nodes.core.types import BoolArray
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.world_model import WorldModels
+from wm_nodes.world_model.positions import judged_things
 from wm_nodes.world_model.validation.goals import goal_metrics
 from wm_nodes.world_model.validation.open_loop import MOVED_M, evaluate_rollouts
 
@@ -79,9 +80,9 @@ class AcceptanceReport:
 
     @property
     def outcome(self) -> Outcome:
-        """failed: in any criterion; else undecided: in any."""
+        """failed: in any criterion; else undecided: in any, or there is none."""
         found = {criterion.outcome for criterion in self.criteria}
-        return "failed" if "failed" in found else "undecided" if "undecided" in found else "passed"
+        return "failed" if "failed" in found else "undecided" if "undecided" in found or not found else "passed"
 
     @property
     def passed(self) -> bool:
@@ -172,7 +173,7 @@ def apply_criteria(
     if any(name.startswith("tool_") for name in metrics):
         criteria, notes = _position_criteria(metrics, config, num_steps)
     else:
-        criteria, notes = [], ["Positions were not judged: the environment has no ground truth to compare with."]
+        criteria, notes = [], ["Positions were not judged: no ground truth names them."]
     for kind, threshold, remedy in (
         ("precision", limits.done_precision, MORE_NEAR_MISSES), ("recall", limits.done_recall, MORE_SUCCESSES),
     ):
@@ -195,12 +196,12 @@ def _position_criteria(
         f"{_at(metrics, 'object_floor_cm', num_steps):.2f} cm (object) and "
         f"{_at(metrics, 'tool_floor_cm', num_steps):.2f} cm (tool) on real frames."
     ]
-    if not get_task(task).moves_object:
+    if "object" not in judged_things(task):
         notes.append(f"The object hardly moves in {task}, so its error is not judged; the tool's is.")
     for name, key, limit in (
         ("object", "object_moved_ratio", limits.object_error_ratio), ("tool", "tool_ratio", limits.tool_error_ratio),
     ):
-        if name == "tool" or get_task(task).moves_object:
+        if name in judged_things(task):
             ratio, *ends = (_at(metrics, f"{key}{end}", num_steps) for end in ("", "_low", "_high"))
             criteria.append(_below(f"{name} error / copying, step {num_steps}", ratio, limit, _interval(*ends)))
     return criteria, notes
@@ -215,19 +216,37 @@ def accept_video_model(
     return AcceptanceReport(config.task, 0, tuple(criteria), {}, told)
 
 
-def accepted_when_made(manifest: Mapping[str, Any], config: RunConfig) -> str:
-    """Say in a line what the held-out metrics in a world model's manifest mean for config.task, without a simulator."""
-    found = manifest.get("heldout", {})
-    metrics = found.get(config.task, found)
-    steps = config.simulation.max_episode_steps
-    if f"tool_ratio_h{steps:02d}" not in metrics:
-        return f"not judged: the model's manifest holds no metrics of held-out episodes of {config.task}"
-    criteria, _ = apply_criteria(metrics, config, steps, None, None)
-    left_out = "the policy in it"
+def report_when_made(
+    manifest: Mapping[str, Any], config: RunConfig, imagined: tuple[int, int] | None = None,
+    real: tuple[int, int] | None = None,
+) -> AcceptanceReport:
+    """What the held-out metrics in a world model's manifest mean for config.task, or the model's own where it is empty,
+    without a simulator; without such metrics there are no criteria of them. imagined, real: as accept_world_model."""
+    spec, held = manifest.get("spec", {}), manifest.get("heldout", {})
+    task, steps = config.task, config.simulation.max_episode_steps
+    if not task:
+        task, steps = spec["task"], spec["max_episode_steps"]
+        config = config.model_copy(update={"task": task})
+    metrics = held.get(task, held)
+    if f"tool_ratio_h{steps:02d}" not in metrics and (spec.get("ground_truth_names", True) or not metrics):
+        criteria, notes = _policy_criteria(config, imagined, real, None)
+        note = f"the model's manifest holds no metrics of held-out episodes of {task}"
+        return AcceptanceReport(task, 0, tuple(criteria), {}, (note, *notes))
+    found, told = apply_criteria(metrics, config, steps, imagined, real)
     if manifest.get("success_threshold") != config.reward.success_threshold:
-        criteria = tuple(row for row in criteria if not row.name.startswith("done"))
+        found = tuple(row for row in found if not row.name.startswith("done"))
+        at = f"reward.success_threshold {config.reward.success_threshold:g}"
+        told = (f"The done signal at {at} was not judged.", *told)
+    return AcceptanceReport(task, int(metrics.get("episodes") or 0), found, {}, told)
+
+
+def accepted_when_made(manifest: Mapping[str, Any], config: RunConfig) -> str:
+    """Say report_when_made in a line."""
+    report, left_out = report_when_made(manifest, config), "the policy in it"
+    if not report.episodes:
+        return f"not judged: {report.notes[0]}"
+    if manifest.get("success_threshold") != config.reward.success_threshold:
         left_out = f"its done signal at reward.success_threshold {config.reward.success_threshold:g} and {left_out}"
-    report = AcceptanceReport(config.task, int(metrics.get("episodes") or 0), criteria, {})
     return (f"{report.words} on {report.episodes} held-out episodes when it was made; {left_out} not judged, without a "
             "simulator")
 
@@ -293,7 +312,7 @@ def _goals(found: Mapping[str, float], config: RunConfig, part: str) -> list[Cri
     outcome: Outcome = "passed" if share >= limits.done_recall else "failed"
     ends = _interval(found["goal_found_low"], found["goal_found_high"])
     criteria = [Criterion(f"{of}: found", share, limits.done_recall, ">=", outcome, BETTER_GOALS, ends)]
-    for name in ("object", "tool") if get_task(part).moves_object else ("tool",):
+    for name in sorted(judged_things(part)):
         copied = found[f"goal_{name}_copy_cm"]
         ratio = found[f"goal_{name}_cm"] / copied if copied > 0 else math.nan
         ends = _interval(found[f"goal_{name}_ratio_low"], found[f"goal_{name}_ratio_high"])

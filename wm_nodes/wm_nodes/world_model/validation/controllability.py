@@ -15,8 +15,9 @@ from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.reward.picture_similarity import psnr_db
 from wm_nodes.world_model.folder import WorldModels
+from wm_nodes.world_model.positions import columns_of
 from wm_nodes.world_model.training.tokenizer import episode_targets
-from wm_nodes.world_model.validation.open_loop import HORIZONS, TOOL, imagine_episodes, position_reader
+from wm_nodes.world_model.validation.open_loop import HORIZONS, imagine_episodes, position_reader
 
 
 def controllability_metrics(
@@ -34,14 +35,16 @@ def controllability_metrics(
     """
     actions = {"command": episodes.actions, "shuffled": np.roll(episodes.actions, 1, axis=0)}
     read = position_reader(models.tokenizer, models.probe)
-    first = episode_targets(episodes)[:, 0][:, TOOL]
+    tool = columns_of(episodes.tasks[0], "tool")
+    first = episode_targets(episodes)[:, 0][:, tool]
     frames, errors = dict[str, UInt8Array](), dict[str, FloatArray]()
     for name, taken in actions.items():
         states = follow(episodes.states[:, 0], taken, spec)
         told = replace(episodes, actions=taken, states=states)
         frames[name] = imagine_episodes(models.tokenizer, models.action, told).frames
         wanted = first[:, None] + states[:, 1:, :3] - states[:, :1, :3]
-        errors[name] = 100 * np.linalg.norm(read(frames[name])[..., TOOL] - wanted, axis=-1)
+        if tool:
+            errors[name] = 100 * np.linalg.norm(read(frames[name])[..., tool] - wanted, axis=-1)
     metrics = dict[str, float]()
     for horizon in sorted({min(h, episodes.num_steps) for h in HORIZONS}):
         rows = np.minimum(episodes.lengths, np.roll(episodes.lengths, 1)) >= horizon

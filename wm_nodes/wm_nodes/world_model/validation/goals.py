@@ -9,9 +9,10 @@ from wm_nodes.core.statistics import bootstrap_ratio, wilson_of_share
 from wm_nodes.core.types import FloatArray
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.world_model.folder import WorldModels
+from wm_nodes.world_model.positions import columns_of
 from wm_nodes.world_model.text import TextModel, imagine_goals, instruction_for
 from wm_nodes.world_model.training.tokenizer import episode_targets
-from wm_nodes.world_model.validation.open_loop import OBJECT, TOOL, position_reader
+from wm_nodes.world_model.validation.open_loop import position_reader
 
 
 @torch.inference_mode()
@@ -48,14 +49,15 @@ def goal_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig
         metrics[f"goal_found{end}"] = value
     errors = dict[tuple[str, str], FloatArray]()
     read, truth = position_reader(models.tokenizer, models.probe), episode_targets(episodes)[rows, reached]
+    places = {name: columns for name in ("object", "tool") if (columns := columns_of(task, name))}
     real = models.tokenizer.encode(episodes.images[rows, reached])
     for ending, frames in (("", imagined.goals), ("_copy", episodes.images[rows, 0])):
         found = read(frames[:, None])[:, 0]
-        for name, columns in (("object", OBJECT), ("tool", TOOL)):
+        for name, columns in places.items():
             errors[name, ending] = 100 * np.linalg.norm(found[:, columns] - truth[:, columns], axis=-1)
             metrics[f"goal_{name}{ending}_cm"] = float(errors[name, ending].mean())
         metrics[f"goal_perceptual{ending}"] = float((models.tokenizer.encode(frames) - real).abs().mean())
-    for name in ("object", "tool"):
+    for name in places:
         low, high = bootstrap_ratio(errors[name, ""], errors[name, "_copy"], seed=0)
         metrics |= {f"goal_{name}_ratio_low": low, f"goal_{name}_ratio_high": high}
     return metrics

@@ -1,6 +1,6 @@
 """Open-loop rollouts of held-out episodes by the action model, compared with the recordings.
 
-Shapes: E episodes, T steps, S tokens, D values per token, J tasks, P probed values (PROBE_NAMES).
+Shapes: E episodes, T steps, S tokens, D values per token, J tasks, P probed values.
 
 Positions are read off pictures, by the judge's own probe (world_model/position_probe.py), which was trained on real
 frames only, and which no loss of the world model trains. Where a model folder has none, predicted frames
@@ -24,30 +24,28 @@ from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.reward.picture_similarity import psnr_db, ssim
 from wm_nodes.world_model.dynamics import ActionModel, done_signal
 from wm_nodes.world_model.position_probe import PositionProbe
+from wm_nodes.world_model.positions import columns_of
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.token_dynamics import TokenActionModel
-from wm_nodes.world_model.tokenizer import PROBE_NAMES, Tokenizer
+from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.tokenizer import episode_targets
 
 HORIZONS = (1, 2, 4, 8, 12, 16, 32, 64)
 MOVED_M = 0.01
 """An object counts as moved when it ends this far from where it began."""
 BATCH = 64
-OBJECT = [PROBE_NAMES.index(name) for name in ("object_x", "object_y")]
-TOOL = [PROBE_NAMES.index(name) for name in ("tool_x", "tool_y", "tool_z")]
 
 
 @dataclass(frozen=True)
 class ImaginedEpisodes:
-    """Rollouts of recorded actions from recorded first frames.
-
-    frames: uint8 (E, T, H, W, 3), frames 1..T. signals: float32 (E, T, J), pessimistic done probability of frames 1..T.
-    uncertainty: float32 (E, T, J).
-    """
+    """Rollouts of recorded actions from recorded first frames."""
 
     frames: UInt8Array
+    """uint8 (E, T, H, W, 3), frames 1..T."""
     signals: FloatArray
+    """float32 (E, T, J), pessimistic done probability of frames 1..T."""
     uncertainty: FloatArray
+    """float32 (E, T, J)."""
 
 
 @torch.inference_mode()
@@ -109,16 +107,17 @@ def evaluate_rollouts(
     `ratio_high`). object_moved_: over the episodes whose object moved. done_<task>_: episodes counted as successful
     when the signal exceeds `threshold` anywhere, against success anywhere in the recording.
 
-    Without ground truth there are no positions, so no object_ and tool_ and no moved_share.
+    Without ground truth, or where the tasks' files name no positions, there is no object_ and tool_ and no moved_share.
     """
     imagined = imagine_episodes(tokenizer, model, episodes)
     truth = episode_targets(episodes)
     metrics: dict[str, float] = {"episodes": float(len(episodes))}
-    has_positions = truth.shape[-1] > 0
+    thing, tool = (columns_of(episodes.tasks[0], name) for name in ("object", "tool"))
+    has_positions = truth.shape[-1] > 0 and bool(thing and tool)
     if has_positions:
         read = position_reader(tokenizer, probe)
         real, predicted = read(episodes.images), read(imagined.frames)
-        moved = np.linalg.norm(truth[:, -1, OBJECT] - truth[:, 0, OBJECT], axis=-1) > MOVED_M
+        moved = np.linalg.norm(truth[:, -1, thing] - truth[:, 0, thing], axis=-1) > MOVED_M
         metrics["moved_share"] = float(moved.mean())
     for horizon in sorted({min(h, episodes.num_steps) for h in HORIZONS}):
         rows = episodes.lengths >= horizon
@@ -134,7 +133,7 @@ def evaluate_rollouts(
             "latents": tokenizer.read_state(latents).cpu().numpy(),
         }
         for name, columns, chosen in (
-            ("object", OBJECT, rows), ("object_moved", OBJECT, rows & moved), ("tool", TOOL, rows),
+            ("object", thing, rows), ("object_moved", thing, rows & moved), ("tool", tool, rows),
         ):
             metrics |= _position_metrics(estimates, truth[:, horizon], columns, chosen, f"{name}_{{}}_{label}")
     frame_mask, labelled = episodes.step_mask, episodes.labelled
@@ -167,8 +166,8 @@ def episode_errors(
     own = [episodes.tasks.index(task if task in episodes.tasks else name) for name in episodes.recorded_tasks]
     signal, happened = _done(imagined, episodes, own)
     errors = {
-        name: 100 * np.linalg.norm(estimate[:, columns] - truth[:, columns], axis=-1)
-        for name, columns in (("object_cm", OBJECT), ("tool_cm", TOOL))
+        f"{name}_cm": 100 * np.linalg.norm(estimate[:, columns] - truth[:, columns], axis=-1)
+        for name in ("object", "tool") if (columns := columns_of(episodes.tasks[0], name))
     }
     return {**errors, "done_right": (signal > threshold) == happened}
 

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 
 from wm_nodes.config.scenes import Scene
-from wm_nodes.config.tasks import Task, get_task, part_of
+from wm_nodes.config.tasks import JudgePart, ModelPart, SimulatorPart, Task, part_of, simulator_part
+from wm_nodes.config.tasks import success as done
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
 from wm_nodes.environments.maniskill.pose_behaviours import MOVING
@@ -16,7 +17,7 @@ PARTS = objects.MODEL_TASKS
 def scene() -> Any:
     from wm_nodes.environments.maniskill.object_scene import ObjectScene
 
-    scenes = {part: get_task(part).scene() for part in PARTS}
+    scenes = {part: simulator_part(part).scene() for part in PARTS}
 
     class AllTasksScene(ObjectScene):
         """Each episode's scene is that of its task."""
@@ -34,16 +35,16 @@ def measure(scene: Any, start: FloatArray | None) -> FloatArray:
 
 
 def success(truth: FloatArray) -> BoolArray:
-    cases = [(truth[..., -1] == number) & get_task(part).success(truth) for number, part in enumerate(PARTS)]
+    cases = [(truth[..., -1] == number) & done(part, truth) for number, part in enumerate(PARTS)]
     return np.asarray(np.logical_or.reduce(cases))
 
 
 def waypoints(truth: FloatArray) -> list[FloatArray]:
-    return get_task(PARTS[int(truth[-1])]).waypoints(truth)
+    return simulator_part(PARTS[int(truth[-1])]).waypoints(truth)
 
 
 def script(behaviour: str, truth: FloatArray, rng: np.random.Generator, full_m: float) -> Any:
-    return get_task(PARTS[int(truth[-1])]).script(behaviour, truth, rng, full_m)
+    return simulator_part(PARTS[int(truth[-1])]).script(behaviour, truth, rng, full_m)
 
 
 def instruct(scene: Scene) -> str:
@@ -53,18 +54,13 @@ def instruct(scene: Scene) -> str:
 
 TASK = Task(
     instruction="do the task with the object",
-    instruct=instruct,
-    actions="pose",
-    scene=scene,
     ground_truth_names=(*objects.GROUND_TRUTH_NAMES, "task"),
-    measure=measure,
     success=success,
-    waypoints=waypoints,
-    script=script,
-    shows_goal=False,
     parts=PARTS,
-    model_tasks=PARTS,
     settings={
         **objects.SETTINGS, "data.behaviours": MOVING, "sft.num_demonstrations": 1500, "sft.num_iterations": 3000,
     },
+    simulator=SimulatorPart(scene, measure, waypoints, script, actions="pose", instruct=instruct),
+    model=ModelPart(tasks=PARTS, positions=objects.POSITIONS),
+    judge=JudgePart(object_height_m=objects.MIDDLE_M),
 )

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from wm_nodes.config.scenes import Scene
-from wm_nodes.config.tasks import Task, WeakPolicy
+from wm_nodes.config.tasks import JudgePart, ModelPart, SimulatorPart, Task, WeakPolicy
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
 from wm_nodes.environments.maniskill.layouts import ANYWHERE, CONTAINERS, Layout, Point, draw, free_of
@@ -42,15 +42,14 @@ def instruct(scene: Scene) -> str:
 
 TASK = Task(
     instruction="move the object onto the carpet",
-    instruct=instruct,
-    actions="pose",
-    scene=scene,
     ground_truth_names=objects.GROUND_TRUTH_NAMES,
-    measure=objects.measure,
     success=success,
-    waypoints=carry_waypoints,
-    script=scripted(carry_waypoints, speed=0.8),
-    model_tasks=objects.MODEL_TASKS,
-    weak_policies=(WeakPolicy(0, 100, 0.25),),
     settings={**objects.SETTINGS, "data.behaviours": CARRYING},
+    simulator=SimulatorPart(
+        scene, objects.measure, carry_waypoints, scripted(carry_waypoints, speed=0.8), actions="pose", instruct=instruct
+    ),
+    model=ModelPart(
+        tasks=objects.MODEL_TASKS, positions=objects.WITH_GOAL, weak_policies=(WeakPolicy(0, 100, 0.25),)
+    ),
+    judge=JudgePart(object_height_m=objects.MIDDLE_M),
 )

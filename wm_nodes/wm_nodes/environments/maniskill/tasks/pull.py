@@ -32,6 +32,7 @@ def instruct(scene: Scene) -> str:
 
 
 TASK = replace(
-    push.TASK, instruction="pull the object towards the robot", instruct=instruct, scene=scene, success=success,
-    weak_policies=(WeakPolicy(4, 100, 0.25),),
+    push.TASK, instruction="pull the object towards the robot", success=success,
+    simulator=replace(push.SIMULATOR, scene=scene, instruct=instruct),
+    model=replace(push.TASK.model, weak_policies=(WeakPolicy(4, 100, 0.25),)),
 )

@@ -3,7 +3,8 @@
 from dataclasses import replace
 from typing import Any
 
-from wm_nodes.config.tasks import WeakPolicy
+from wm_nodes.config.tasks import ModelPart, WeakPolicy
+from wm_nodes.environments.maniskill import table_top
 from wm_nodes.environments.maniskill.tasks import push_cube
 
 
@@ -14,6 +15,7 @@ def scene() -> Any:
 
 
 TASK = replace(
-    push_cube.TASK, instruction="pull the blue cube into the red target", scene=scene, settings={}, model_tasks=(),
-    weak_policies=(WeakPolicy(4, 4, 0.3),),
+    push_cube.TASK, instruction="pull the blue cube into the red target", settings={},
+    simulator=replace(push_cube.SIMULATOR, scene=scene),
+    model=ModelPart(positions=table_top.POSITIONS, weak_policies=(WeakPolicy(4, 4, 0.3),)),
 )

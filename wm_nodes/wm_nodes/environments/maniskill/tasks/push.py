@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from wm_nodes.config.scenes import Scene
-from wm_nodes.config.tasks import Task, WeakPolicy
+from wm_nodes.config.tasks import JudgePart, ModelPart, SimulatorPart, Task, WeakPolicy
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
 from wm_nodes.environments.maniskill.layouts import CONTAINERS, Layout, Point, Rectangle, draw, free_of
@@ -52,21 +52,20 @@ def instruct(scene: Scene) -> str:
     return f"push the {scene.object} away from the robot"
 
 
+SIMULATOR = SimulatorPart(
+    scene, objects.measure, waypoints, scripted(waypoints, speed=0.5), actions="pose", instruct=instruct
+)
 TASK = Task(
     instruction="push the object away from the robot",
-    instruct=instruct,
-    actions="pose",
-    scene=scene,
     ground_truth_names=objects.GROUND_TRUTH_NAMES,
-    measure=objects.measure,
     success=success,
-    waypoints=waypoints,
-    script=scripted(waypoints, speed=0.5),
-    shows_goal=False,
-    model_tasks=objects.MODEL_TASKS,
-    weak_policies=(WeakPolicy(2, 100, 0.25),),
     settings={
         **objects.SETTINGS, "data.behaviours": MOVING, "policy.init_log_std": -2.0, "ppo.target_kl": 0.2,
         "ppo.kl_reference_weight": 0.01,
     },
+    simulator=SIMULATOR,
+    model=ModelPart(
+        tasks=objects.MODEL_TASKS, positions=objects.POSITIONS, weak_policies=(WeakPolicy(2, 100, 0.25),)
+    ),
+    judge=JudgePart(object_height_m=objects.MIDDLE_M),
 )

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from wm_nodes.config.scenes import Scene
-from wm_nodes.config.tasks import Task, WeakPolicy
+from wm_nodes.config.tasks import JudgePart, ModelPart, SimulatorPart, Task, WeakPolicy
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
 from wm_nodes.environments.maniskill.layouts import ANYWHERE, CONTAINERS, Layout, Point, draw, free_of
@@ -48,17 +48,15 @@ def instruct(scene: Scene) -> str:
 
 TASK = Task(
     instruction="move the gripper above the object",
-    instruct=instruct,
-    actions="pose",
-    scene=scene,
     ground_truth_names=objects.GROUND_TRUTH_NAMES,
-    measure=objects.measure,
     success=success,
-    waypoints=waypoints,
-    script=scripted(waypoints, speed=0.8),
-    shows_goal=False,
-    model_tasks=objects.MODEL_TASKS,
-    weak_policies=(WeakPolicy(3, 100, 0.25),),
     settings={**objects.SETTINGS, "data.behaviours": MOVING},
-    moves_object=False,
+    simulator=SimulatorPart(
+        scene, objects.measure, waypoints, scripted(waypoints, speed=0.8), actions="pose", instruct=instruct
+    ),
+    model=ModelPart(
+        tasks=objects.MODEL_TASKS, positions=objects.POSITIONS, moves_object=False,
+        weak_policies=(WeakPolicy(3, 100, 0.25),),
+    ),
+    judge=JudgePart(object_height_m=objects.MIDDLE_M),
 )

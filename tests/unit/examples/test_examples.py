@@ -1,0 +1,52 @@
+"""Every example runs by the command that it begins with."""
+
+import importlib
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+import examples
+from wm_nodes.config.tasks import VARIABLE, get_task, task_names
+
+NAMES = ("own_environment", "own_learner", "own_policy", "own_reward", "own_task")
+FOLDER = Path(str(examples.__file__)).parent
+
+
+def run_command(name: str, monkeypatch: pytest.MonkeyPatch, folder: Path) -> int | None:
+    """Run the command of a file's docstring in this process, what it writes below `folder`."""
+    text = (FOLDER / f"{name}.py").read_text(encoding="utf-8").split('"""')[1]
+    command = re.search(r"^(\w+=\S+ )?python -m .*(\n .*)*", text, re.MULTILINE)
+    assert command, f"{name}.py does not begin with its command"
+    words = [word.replace("/tmp", str(folder)) for word in shlex.split(command[0])]
+    while "=" in words[0]:
+        monkeypatch.setenv(*words.pop(0).split("=", 1))
+    assert words[:2] == ["python", "-m"]
+    code: int | None = importlib.import_module(words[2]).main(words[3:])
+    return code
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "own_task"])
+def test_an_example_is_trained_with_by_its_command(
+    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_command(name, monkeypatch, tmp_path)
+    kind = "real" if name == "own_environment" else "imagined"
+    assert len(re.findall(rf"version \d+: {kind} success \d", capsys.readouterr().out)) == 3
+
+
+@pytest.mark.rendering
+def test_the_own_task_is_collected_by_its_command(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command("own_task", monkeypatch, tmp_path) == 0
+    assert "own_task" in task_names()
+    assert re.search(r"own_task +expert +2 +100", capsys.readouterr().out)
+    monkeypatch.delenv(VARIABLE)
+    get_task.cache_clear()
+
+
+def test_an_example_has_20_to_40_lines() -> None:
+    sizes = {path.stem: len(path.read_text(encoding="utf-8").splitlines()) for path in FOLDER.glob("own_*.py")}
+    assert sorted(sizes) == sorted(NAMES) and all(20 <= size <= 40 for size in sizes.values()), sizes

@@ -1,0 +1,169 @@
+"""Models as the environment of a policy: what a policy that is trained in each is worth in the simulator, and how each
+ranks policies.
+"""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.environments.policies import (
+    SIMULATOR,
+    WORLD_MODEL,
+    Workplace,
+    measure_policy,
+    rank_policies,
+    train_in,
+)
+from benchmarks.experiment import Experiment, console
+from wm_nodes.apps import options
+from wm_nodes.config.load import load_config
+from wm_nodes.config.scenes import check_scenes
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.device import compute_device
+from wm_nodes.core.progress import tqdm
+from wm_nodes.reports.console_table import make_table
+
+
+@dataclass(kw_only=True)
+class InModels(Experiment):
+    """An experiment on models as the environment of a policy; the task's world model is always the first of them."""
+
+    video_models: tuple[Path, ...] = ()
+    """Folders of video models that can be stepped."""
+    preset: str = "cpu"
+    """Of the settings: a name, or a .yaml."""
+    task: str = "push_cube"
+    """Of the policies."""
+    model_dir: Path | None = None
+    """World model instead of the shipped one."""
+    work: Path = Path("runs/environments")
+    """Folder of first frames and policies; what is there is kept."""
+
+    @classmethod
+    def add_settings(cls, parser: argparse.ArgumentParser) -> None:
+        options.add_set(parser)
+        options.add_device(parser)
+
+    @classmethod
+    def settings_of(cls, arguments: argparse.Namespace) -> dict[str, Any]:
+        return options.settings(arguments)
+
+    @property
+    def models(self) -> list[str]:
+        return [WORLD_MODEL, *map(str, self.video_models)]
+
+    def workplace(self, seed: int) -> Workplace:
+        config = load_config(self.preset, {"task": self.task, **self.settings, "seed": seed})
+        compute_device(config.device)
+        model_dir = self.model_dir or shipped_model(config.task)
+        return Workplace(config, model_dir, self.work.absolute() / f"{config.task}_{seed}")
+
+
+@dataclass(kw_only=True)
+class TrainedIn(InModels):
+    """Train a policy in each model, measure it in the simulator. The task's world model is always the first of them."""
+
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """A training in each model for each."""
+    control: bool = False
+    """Train in the simulator, too, with as many steps."""
+    scenes: tuple[str, ...] = ()
+    """Measure the policies there, too: splits or scenes, as simulation.scenes."""
+
+    def run(self) -> None:
+        rows, scenes = self.read(), tuple(map(check_scenes, self.scenes))
+        for seed in self.seeds:
+            workplace = self.workplace(seed)
+            updates = workplace.config.ppo.updates
+            for model in [*self.models, *([SIMULATOR] if self.control else [])]:
+                if is_finished(rows, workplace.identity(model, scenes)):
+                    continue
+                with tqdm(total=updates, desc=f"{Path(model).name}, seed {seed}", unit="update") as bar:
+                    rows.append(train_in(workplace, model, scenes, bar.update))
+                self.write({"rows": rows})
+                if report := rows[-1]["acceptance"]:
+                    why = ", ".join(report["failed"] or report["undecided"])
+                    console.print(f"{Path(model).name}, seed {seed}: acceptance {report['outcome']} ({why})")
+        columns = (
+            "trained in", "task", "seed", "scenes", "real before", "real after", "gain", "imagined", "acceptance"
+        )
+        names = differing(rows)
+        console.print(make_table(
+            "policies trained in each model", (*columns, *(["settings"] if names else [])),
+            [(*line, *([_of_settings(row, names)] if names else [])) for row in rows for line in _lines(row)],
+        ))
+        if names:
+            console.print(f"settings: {', '.join(names)}", soft_wrap=True)
+
+
+@dataclass(kw_only=True)
+class Ranking(InModels):
+    """Imagined success of policies in each model against their real success. The task's world model is always the first
+    of the models."""
+
+    policies: tuple[Path, ...]
+    """Weights, 8 or more files."""
+    seed: int = 0
+    """Of the starts and of the bootstrap."""
+
+    def run(self) -> None:
+        rows, workplace, models = self.read(), self.workplace(self.seed), self.models
+        for path in tqdm(self.policies, desc="policies", unit="policy"):
+            wanted = {"policy": str(path), "config": workplace.config.model_dump(mode="json")}
+            if not is_finished([row for row in rows if set(models) <= row["imagined"].keys()], wanted):
+                rows.append(measure_policy(workplace, path, models))
+                self.write({"rows": rows})
+        correlations = rank_policies(rows, models, self.seed)
+        self.write({"rows": rows, "correlations": correlations})
+        console.print(make_table(
+            f"imagined against real success of {len(rows)} policies", ("model", "rank correlation", "95 %"),
+            [(model, f"{one['correlation']:+.2f}", f"{one['low']:+.2f} to {one['high']:+.2f}")
+             for model, one in correlations.items()],
+        ))
+
+
+def is_finished(rows: Sequence[Mapping[str, Any]], wanted: Mapping[str, Any]) -> bool:
+    """Whether one of the rows has all of the wanted values."""
+    return any(all(row.get(name) == value for name, value in wanted.items()) for row in rows)
+
+
+def differing(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """The dotted settings, but task and seed, that are not the same in all rows that hold theirs."""
+    known = [_dotted(row["config"]) for row in rows if "config" in row]
+    names = dict.fromkeys(name for settings in known for name in settings)
+    return [name for name in names if len({repr(one.get(name)) for one in known}) > 1 and name not in ("task", "seed")]
+
+
+def _dotted(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat = dict[str, Any]()
+    for name, value in values.items():
+        flat |= _dotted(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat
+
+
+def _of_settings(row: dict[str, Any], names: Sequence[str]) -> str:
+    settings = _dotted(row.get("config", {}))
+    return ", ".join(str(settings.get(name, "?")) for name in names)
+
+
+def _outcome(row: dict[str, Any]) -> str:
+    """What acceptance says of the model of a row; nothing of the simulator, nor of rows of earlier versions."""
+    return str(row.get("acceptance", {}).get("outcome", ""))
+
+
+def _lines(row: dict[str, Any]) -> list[tuple[str, ...]]:
+    """A line of the table for the scenes of the training, and one for each of the others."""
+    first = {"before": row["real_before"], "after": row["real_after"], "gain": row["real_gain"]}
+    imagined = f"{_percent(row['imagined_before'])} -> {_percent(row['imagined_after'])}"
+    return [
+        (row["model"], row["task"], str(row["seed"]), name, _percent(found["before"]), _percent(found["after"]),
+         "{difference:+.3f} ({low:+.3f} to {high:+.3f})".format(**found["gain"]),
+         *(("", "") if name else (imagined, _outcome(row))))
+        for name, found in {"": first, **row.get("elsewhere", {})}.items()
+    ]
+
+
+def _percent(rate: dict[str, float]) -> str:
+    return f"{100 * rate['rate']:.1f} % of {rate['episodes']:.0f}"

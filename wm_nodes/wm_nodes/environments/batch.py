@@ -1,0 +1,101 @@
+"""One environment, a robot or a simulator, as a batch of them: what core.types.Environment asks beyond it. Shapes: N
+copies, A action, S state, H W 3 image."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from wm_nodes.core.seeding import stream_seed
+from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.tool_control import check_actions
+from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+
+
+class Frame(NamedTuple):
+    """What one environment shows after a reset or a step."""
+
+    image: UInt8Array
+    """uint8 (H, W, 3), cameras side by side."""
+    state: FloatArray
+    """float32 (S,), units of the spec."""
+    success: bool = False
+    """Whether the task is done, which terminates the episode."""
+    over: bool = False
+    """Whether the episode cannot go on without success: it counts as truncated."""
+
+
+class SingleEnvironment(Protocol):
+    """What has to be written for an environment."""
+
+    def reset(self, seed: int) -> Frame:
+        """Begin an episode. seed: decides how, where that can be had; a real robot may leave it aside."""
+        ...
+
+    def step(self, action: FloatArray) -> Frame:
+        """Act. action: float32 (A,) in [-1, 1]."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class EnvironmentBatch:
+    """Copies that are stepped one after the other in this process; their episodes end with success, where a copy says
+    so, and after spec.max_episode_steps.
+
+    Args:
+        spec: of one of them; without ground truth.
+        seed: root seed of resets without a given seed.
+    """
+
+    def __init__(self, spec: EnvironmentSpec, copies: Sequence[SingleEnvironment], seed: int) -> None:
+        if spec.ground_truth_names:
+            raise ValueError(f"copies say no ground truth, the spec names {spec.ground_truth_names}; leave it empty")
+        count = len(copies)
+        self.spec = replace(spec, num_envs=count)
+        self._copies, self._seed, self._resets = copies, seed, 0
+        self._images = np.zeros((count, spec.height, spec.width, 3), np.uint8)
+        self._states = np.zeros((count, spec.state_dim), np.float32)
+        self._ids, self._steps = np.zeros(count, np.uint64), np.zeros(count, np.uint32)
+        self._ended = np.ones(count, bool)
+
+    def reset(self, mask: BoolArray | None = None, seeds: UInt64Array | None = None) -> Observation:
+        for env in range(len(self._copies)) if mask is None else np.flatnonzero(mask):
+            self._resets += 1
+            seed = stream_seed(self._seed, "reset", self._resets) if seeds is None else int(seeds[env])
+            self._show(env, self._copies[env].reset(seed))
+            self._ids[env], self._steps[env], self._ended[env] = self._resets, 0, False
+        return self._observation()
+
+    def step(self, actions: FloatArray) -> StepResult:
+        check_actions(actions, self.spec)
+        valid, success, over = ~self._ended, np.zeros_like(self._ended), np.zeros_like(self._ended)
+        for env in np.flatnonzero(valid):
+            frame = self._copies[env].step(actions[env])
+            self._show(env, frame)
+            success[env], over[env] = frame.success, frame.over
+        self._steps += valid.astype(np.uint32)
+        truncated = valid & ~success & (over | (self._steps >= self.spec.max_episode_steps))
+        self._ended = self._ended | success | truncated
+        count = len(self._copies)
+        return StepResult(
+            self._observation(), success, truncated, success.astype(np.float32), np.zeros(count, np.float32),
+            np.zeros((count, 0), np.float32), valid,
+        )
+
+    def goals(self) -> tuple[UInt8Array, BoolArray] | None:
+        return None
+
+    def close(self) -> None:
+        for copy in self._copies:
+            copy.close()
+
+    def _show(self, env: int, frame: Frame) -> None:
+        for name, value, kept in (("image", frame.image, self._images[env]), ("state", frame.state, self._states[env])):
+            if (shape := np.shape(value)) != kept.shape:
+                raise ValueError(f"{self.spec.env_id} shows an {name} of shape {shape}, and its spec says {kept.shape}")
+            kept[...] = value
+
+    def _observation(self) -> Observation:
+        return Observation(self._images.copy(), self._states.copy(), self._ids.copy(), self._steps.copy())

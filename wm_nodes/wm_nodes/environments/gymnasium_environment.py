@@ -1,0 +1,96 @@
+"""Any Gymnasium environment as ours: settings `gymnasium`. Copies step one after the other in this process.
+
+gym.py goes the other way: our tasks for Gymnasium.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import cv2
+import gymnasium
+import numpy as np
+
+from wm_nodes.config.environments import GymnasiumConfig
+from wm_nodes.core.specs import SOURCE_SIMULATOR, EnvironmentSpec
+from wm_nodes.core.types import FloatArray, UInt8Array
+from wm_nodes.environments.batch import EnvironmentBatch, Frame
+
+RENDER = "render"
+"""gymnasium.pixels of an environment whose picture is what it renders."""
+
+
+def gymnasium_environment(config: GymnasiumConfig, num_envs: int, seed: int) -> EnvironmentBatch:
+    """Make num_envs copies. Raises ValueError: an environment that does not exist or does not fit the settings."""
+    copies = [GymnasiumCopy(config) for _ in range(num_envs)]
+    return EnvironmentBatch(copies[0].spec(), copies, seed)
+
+
+class GymnasiumCopy:
+    """One of the copies: pictures of gymnasium.image_size, actions of [-1, 1] over its Box, measured states.
+
+    An end that the environment calls terminated, but not a success, truncates the episode: terminated means success
+    here.
+    """
+
+    def __init__(self, config: GymnasiumConfig) -> None:
+        self._config = config
+        rendered = {"render_mode": "rgb_array"} if config.pixels == RENDER else {}
+        try:
+            self._env: gymnasium.Env[Any, Any] = gymnasium.make(config.env_id, **{**rendered, **config.kwargs})
+        except (gymnasium.error.Error, ImportError, TypeError) as error:
+            raise ValueError(
+                f"gymnasium.env_id {config.env_id!r} with gymnasium.kwargs {config.kwargs}: {error}; a package that "
+                "registers it is named as package:name"
+            ) from None
+        box = self._env.action_space
+        if not isinstance(box, gymnasium.spaces.Box) or box.shape != (box.low.size,) or not box.is_bounded():
+            raise ValueError(f"{config.env_id} takes actions of {box}; only a bounded, flat Box can be scaled")
+        self._middle, self._half = (box.high + box.low) / 2, (box.high - box.low) / 2
+
+    def spec(self) -> EnvironmentSpec:
+        config, made = self._config, self._env.spec
+        limit = made.max_episode_steps if made else None
+        if not limit:
+            raise ValueError(f"{config.env_id} sets no limit to an episode; give gymnasium.kwargs max_episode_steps")
+        height, width = config.image_size
+        observed = self._env.observation_space.sample()
+        states = [f"{key}.{i}" for key in config.state for i in range(np.size(_part(observed, key)))]
+        return EnvironmentSpec(
+            env_id=f"gymnasium/{config.env_id}", task=config.env_id, instruction=config.instruction,
+            source=SOURCE_SIMULATOR, num_envs=1, height=height, width=width, cameras=(config.pixels,),
+            action_names=tuple(f"action.{i}" for i in range(len(self._half))), action_units=("1",) * len(self._half),
+            action_scale=tuple(map(float, self._half)), state_names=tuple(states), state_units=("1",) * len(states),
+            ground_truth_names=(), control_period_s=1 / float(self._env.metadata.get("render_fps") or 10),
+            max_episode_steps=limit,
+        )
+
+    def reset(self, seed: int) -> Frame:
+        return self._frame(self._env.reset(seed=seed % 2**31)[0])
+
+    def step(self, action: FloatArray) -> Frame:
+        taken = (self._middle + self._half * action).astype(self._env.action_space.dtype)
+        observed, _, terminated, truncated, info = self._env.step(taken)
+        success = bool(info.get(self._config.success)) if self._config.success else bool(terminated)
+        return self._frame(observed, success, bool(terminated or truncated))
+
+    def close(self) -> None:
+        self._env.close()
+
+    def _frame(self, observed: Any, success: bool = False, over: bool = False) -> Frame:
+        pixels = self._config.pixels
+        image: UInt8Array = np.asarray(self._env.render() if pixels == RENDER else _part(observed, pixels))
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+            raise ValueError(f"gymnasium.pixels {pixels!r} gives {image.dtype} {image.shape}, not uint8 (H, W, 3)")
+        height, width = self._config.image_size
+        if image.shape[:2] != (height, width):
+            image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        parts = [np.ravel(_part(observed, key)) for key in self._config.state]
+        return Frame(image, np.concatenate([np.zeros(0), *parts]).astype(np.float32), success, over)
+
+
+def _part(observed: Any, key: str) -> Any:
+    """The value of an observation of that name; an observation that is no mapping has one, called observation."""
+    values: Mapping[str, Any] = observed if isinstance(observed, Mapping) else {"observation": observed}
+    if key not in values:
+        raise ValueError(f"an observation has no {key!r}; gymnasium.state and .pixels may name {sorted(values)}")
+    return values[key]
