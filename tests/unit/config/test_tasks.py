@@ -14,9 +14,10 @@ from pushing_scene import episode
 
 import wm_nodes
 from wm_nodes.apps import cli
-from wm_nodes.config.load import ConfigError, default_task, load_config
+from wm_nodes.config.load import ConfigError, load_config
 from wm_nodes.config.tasks import (
     VARIABLE,
+    default_task,
     get_task,
     is_simulated,
     model_tasks,

@@ -21,10 +21,10 @@ from rich.table import Table
 from wm_nodes.apps.model_refresh_loop import round_config, split_updates
 from wm_nodes.apps.options import add_preset, add_threads, prepare_torch, settings
 from wm_nodes.apps.policy_run import success_rate
-from wm_nodes.config.load import default_task, dump_config, load_config, preset_names
+from wm_nodes.config.load import dump_config, load_config, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.config.tasks import model_tasks
+from wm_nodes.config.tasks import default_task, model_tasks
 from wm_nodes.core.device import compute_device
 from wm_nodes.core.files import text_lines
 from wm_nodes.core.model_folder import files_sha256

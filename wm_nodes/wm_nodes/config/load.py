@@ -74,11 +74,6 @@ def _load(schema: type[Config], loop: str, preset: str, overrides: dict[str, Any
         raise refusal(error, f"{schema.__module__.replace('.', '/')}.py", file) from None
 
 
-def default_task() -> str:
-    """The task of base.yaml."""
-    return str(read_preset("base")["task"])
-
-
 def default_judge() -> JudgeConfig:
     """The judge of both loops, as presets/judge.yaml sets it."""
     return JudgeConfig.model_validate(_read(PRESETS / "judge.yaml")["judge"])

@@ -12,8 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from wm_nodes.config.load import default_task
-from wm_nodes.config.tasks import task_names
+from wm_nodes.config.tasks import default_task, task_names
 from wm_nodes.launching.graph import Graph, GraphError, NodeSpec, ParameterValue
 
 TRUTHS = ("true", "false")
