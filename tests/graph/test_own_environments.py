@@ -29,7 +29,7 @@ from wm_nodes.reports.summary import read_summary
 from wm_nodes.world_model import DeviceEnvironment, load_model_folder
 from wm_nodes.world_model.validation.acceptance import accept_world_model
 
-pytestmark = pytest.mark.graph
+pytestmark = [pytest.mark.graph, pytest.mark.slow]
 STEPS = 120
 OWN = {
     "arm": {"environment.factory": "examples.own_environment:make"},

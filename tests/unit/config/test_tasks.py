@@ -19,7 +19,7 @@ from wm_nodes.config.tasks import (
     VARIABLE,
     default_task,
     get_task,
-    is_simulated,
+    has_simulator,
     model_tasks,
     recorded_task,
     shares_scene,
@@ -83,7 +83,7 @@ def test_a_robots_task_is_its_instruction_and_success_is_what_was_recorded(
     monkeypatch.setenv(VARIABLE, "robot_tasks")
     config = load_config("cpu", {"task": "fold"})
     assert get_task("fold").instruction == "fold the towel" and config.task == "fold"
-    assert not is_simulated("fold") and shares_scene("fold", "fold") and not shares_scene("reach", "fold")
+    assert not has_simulator("fold") and shares_scene("fold", "fold") and not shares_scene("reach", "fold")
     with pytest.raises(ValueError, match="'fold' has no `simulator` in its file"):
         simulation_spec("fold", config.simulation, 1)
     with pytest.raises(ValueError, match="'fold' has no success rule"):

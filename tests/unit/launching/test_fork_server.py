@@ -33,6 +33,7 @@ def imported_with_cuda_guarded(modules: list[str]) -> "subprocess.CompletedProce
     return subprocess.run([sys.executable, "-c", GUARDED, *modules], capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_no_module_that_is_imported_before_nodes_fork_asks_for_a_gpu(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

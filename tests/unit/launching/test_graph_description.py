@@ -262,6 +262,7 @@ class StubLaunch:
         }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scenario", "compose"), FILES)
 def test_both_faces_of_a_launch_file_start_the_same_processes(
     scenario: str, compose: dict[str, str], given: dict[str, str], repository: Path, monkeypatch: pytest.MonkeyPatch

@@ -609,7 +609,7 @@ class TestFolder:
         scope = run_documented(folder, tmp_path, "cpu", "bfloat16")
         assert scope["report"].kept == 4 and scope["learner"].version == 4
         trained = dict(scope["public"].velocity.named_parameters())
-        other = load_public_model(folder, LoadSettings(dtype="bfloat16", text=False)).velocity
+        other = load_public_model(folder, LoadSettings(dtype="bfloat16", max_tokens=12)).velocity
         load_lora(other, tmp_path)
         adapter = {name: p for name, p in other.named_parameters() if "lora_B" in name}
         assert adapter and all(torch.equal(p, trained[name]) for name, p in adapter.items())

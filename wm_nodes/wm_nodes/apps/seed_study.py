@@ -30,10 +30,11 @@ from wm_nodes.core.model_folder import files_sha256
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import Environment
+from wm_nodes.environments.registry import make_environment
 from wm_nodes.policy_rl.acceptance import accept_model
 from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
 from wm_nodes.policy_rl.exploit_meter import ExploitMeter, make_exploit_meter
-from wm_nodes.policy_rl.factories import load_policy, make_endogenous_reward, make_imagined_environment
+from wm_nodes.policy_rl.factories import load_policy, make_imagined_environment, make_reward
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import prepare_start
 from wm_nodes.policy_rl.model_refresh import Round, refresh_round, run_rounds, split_updates
@@ -41,7 +42,6 @@ from wm_nodes.policy_rl.rollouts import rollout_statistics
 from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reports.summary import acceptance_outcome
-from wm_nodes.reward import RewardModel, RuleReward
 from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model.folder import read_world_manifest
 
@@ -84,6 +84,9 @@ def run(arguments: argparse.Namespace) -> None:
         for seed in arguments.seeds:
             config = load_config(arguments.preset, {"task": task, "seed": seed, **settings(arguments)})
             compute_device(config.device)
+            if "simulator" in arguments.arms and config.environment.factory != config.evaluation.environment:
+                raise ValueError(f"environment.factory is {config.environment.factory}, and policies are measured in "
+                                 f"evaluation.environment {config.evaluation.environment}; set both to the same")
             model_dir, text = arguments.model_dir or shipped_model(task), dump_config(config)
             configs.add(text)
             made = {"config": text, "world_model_sha256": files_sha256(read_world_manifest(model_dir))}
@@ -175,16 +178,14 @@ def _plain_items(row: Mapping[str, Any]) -> set[tuple[str, Any]]:
 
 
 def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path, identity: Mapping[str, Any]) -> None:
-    from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-
     started = time.monotonic()
-    run_dir = folder / f"{config.task}_{config.seed}"
+    run_dir = folder / f"{config.task or 'own'}_{config.seed}"
     starts, weak = prepare_start(config, run_dir, model_dir)
     policy = load_policy(config, model_dir, weak)
-    real = ManiSkillEnvironment(config.task, config.simulation, SIMULATOR_ENVS, seed=config.seed)
+    real = make_environment(config, config.evaluation.environment, num_envs=SIMULATOR_ENVS, seed=config.seed)
 
     def measure(folder: Path) -> tuple[EvaluationResult, EvaluationResult]:
-        """In the simulator and in the world model of a folder."""
+        """In evaluation.environment and in the world model of a folder."""
         how = config.evaluation
         imagined = make_imagined_environment(config, folder, starts, num_envs=config.ppo.num_envs, seed=config.seed)
         return (
@@ -255,7 +256,7 @@ def _train(
     meter: ExploitMeter | None = None,
 ) -> list[dict[str, float]]:
     """Train in place; return success rate, KL and environment steps of each update."""
-    reward: RewardModel = RuleReward() if arm == "simulator" else make_endogenous_reward(config, model_dir)
+    reward = make_reward(config, None if arm == "simulator" else model_dir)
     course: list[dict[str, float]] = []
     with tqdm(total=config.ppo.updates, desc=f"{config.task} seed {config.seed} in {arm}", unit="update") as bar:
         for rollout, metrics in train_policy(policy, env, reward, config, meter):
