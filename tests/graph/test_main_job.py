@@ -74,8 +74,8 @@ def test_two_online_rounds_refresh_the_model_and_a_resumed_run_repeats_only_what
     run_dir = tmp_path / "run"
     model = make_model_folder(tmp_path / "model")
     write_some_starts(run_dir / "starts.safetensors")
-    arguments = [*SMALL, "--force", "--rounds", "2", "--model-dir", str(model), "--run-dir", str(run_dir),
-                 "--evaluation.episodes", "2", "--compose"]
+    arguments = [*SMALL, "--force", "--model_refresh.num_rounds", "2", "--model-dir", str(model),
+                 "--run-dir", str(run_dir), "--evaluation.episodes", "2", "--compose"]
     done = train_policy(arguments, ros_domain)
     assert done.returncode == 0, done.stdout + done.stderr
     assert {path.name for path in run_dir.iterdir()} <= RUN_ENTRIES, "a peer may write what is not listed there"
