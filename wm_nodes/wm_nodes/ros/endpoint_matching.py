@@ -108,18 +108,18 @@ class EndpointTable:
                 and all(name in writers(topic) for topic in incoming & peer.publishes)
             ):
                 linked.add(key)
-        own = _Peer(self._session, active, outgoing, incoming, frozenset(linked))
-        changed = own != self._own
+        mine = _Peer(self._session, active, outgoing, incoming, frozenset(linked))
+        changed = mine != self._own
         with self._lock:
-            self._own = own
+            self._own = mine
         return changed
 
     def announcement(self) -> NodeLinks:
         """What this node knows of itself since the last refresh()."""
-        own, names = self._own, sorted(self._own.linked)
+        mine, names = self._own, sorted(self._own.linked)
         return NodeLinks(
-            session=self._session, node=self._own_name, active=own.active, publishes=sorted(own.publishes),
-            subscribes=sorted(own.subscribes), linked=[name for name, _ in names],
+            session=self._session, node=self._own_name, active=mine.active, publishes=sorted(mine.publishes),
+            subscribes=sorted(mine.subscribes), linked=[name for name, _ in names],
             linked_sessions=[session for _, session in names],
         )
 
