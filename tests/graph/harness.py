@@ -33,7 +33,7 @@ from wm_nodes.ros.clients import goal_result
 from wm_nodes.ros.endpoint_matching import EndpointTable
 from wm_nodes.ros.qos import topic
 
-DOMAINS = range(20, 90)
+DOMAINS = range(20, 60)
 PORT, FIRST_PORT, PORTS_PER_DOMAIN = "fastrtps_port", 7400, 250
 """Of Fast DDS: names of files in /dev/shm, and the numbers of DDS."""
 TOY_FOLDER = Path(__file__).parent

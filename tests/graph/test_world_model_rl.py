@@ -36,7 +36,7 @@ from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.recorded_buffers import RecordedClips, read_clips, rescore
 from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, ClipScores, load_probe
 from wm_nodes.video_rl.sampling import RecordedContexts
-from wm_nodes.video_rl.train import post_train
+from wm_nodes.video_rl.train import post_train, sample_buffers
 from wm_nodes.video_rl.training_run import CHECKPOINT, VIDEO_FILES, VideoRun, evaluated_uri, progress
 from wm_nodes.video_rl.validation import context_scores
 from wm_nodes.world_model.position_probe import PositionProbe
@@ -91,7 +91,7 @@ def test_the_graph_gives_the_weights_of_video_rl_train_bit_for_bit(
     folder = load_video_folder(run_dir / "video_model")
     run = VideoRun(folder.network, config, tmp_path)
     source, frames = RecordedContexts(folder, contexts, config, probe), []
-    for buffer, _ in post_train(run, source, config.iterations):
+    for buffer, _ in post_train(run, sample_buffers(source, run, config.iterations)):
         frames.append(folder.codec.decode(buffer.rollout.latents))
     run.close()
     for uri in (VIDEO_FILES.uri(4), evaluated_uri(4, config)):

@@ -24,7 +24,7 @@ from wm_nodes.video_model.folder import load_video_folder, save_video_folder
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.reference_reward import load_probe
 from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
-from wm_nodes.video_rl.train import post_train
+from wm_nodes.video_rl.train import post_train, sample_buffers
 from wm_nodes.video_rl.training_run import VIDEO_FILES
 
 EPISODES, STEPS, STRIDE = 4, 4, 2
@@ -89,7 +89,7 @@ class LocalLoop:
         )
         self._network = load_video_folder(folder).network
         self._learner = GrpoLearner(self._network, config.grpo, config.rollout, seed=config.seed)
-        self._training = post_train(self._learner, self, ITERATIONS)
+        self._training = post_train(self._learner, sample_buffers(self, self._learner, ITERATIONS))
         self._files = [self._packed()]
         self.versions = [0]
         """Before each iteration that was made, and now."""

@@ -34,7 +34,7 @@ from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_model.tokenizer_codec import codec_of_world_model
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.reference_reward import load_probe
-from wm_nodes.video_rl.train import post_train
+from wm_nodes.video_rl.train import post_train, sample_buffers
 
 MODEL_DIR, FPS = shipped_model("push_cube"), 2.5
 HIDDEN = {"groups.hide_actions": True, "model.training.hide_actions": 0.5}
@@ -69,7 +69,7 @@ def test_the_agents_reward_is_mixed_with_others_and_is_what_the_service_says_of_
     assert_close(found.rewards["total"], found.rewards["agent"] + 0.5 * found.rewards["psnr_db"], equal_nan=True)
     learner = GrpoLearner(folder.network, config.grpo, config.rollout, seed=config.seed)
     with JudgedContexts(folder, contexts, config, load_probe(MODEL_DIR), FPS) as source:
-        (buffer, report), = post_train(learner, source, 1)
+        (buffer, report), = post_train(learner, sample_buffers(source, learner, 1))
     assert torch.equal(buffer.rewards["total"].nan_to_num(), found.rewards["total"].nan_to_num())
     assert report.reward_mean == pytest.approx(float(found.rewards["total"].mean()))
 
@@ -83,7 +83,7 @@ def test_the_preset_outcome_trains_on_half_outcome_and_half_agent(given: Any) ->
     before = {name: value.clone() for name, value in folder.network.state_dict().items()}
     learner = GrpoLearner(folder.network, config.grpo, config.rollout, seed=config.seed)
     with JudgedContexts(folder, contexts, config, load_probe(MODEL_DIR), FPS) as source:
-        (buffer, report), = post_train(learner, source, 1)
+        (buffer, report), = post_train(learner, sample_buffers(source, learner, 1))
     rewards = buffer.rewards
     assert_close(rewards["total"], (rewards["outcome"] + rewards["agent"]) / 2, equal_nan=True)
     assert all(rewards[name][buffer.valid].std() > 0 for name in config.rewards) and buffer.valid.sum() >= 4

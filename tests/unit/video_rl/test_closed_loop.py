@@ -24,7 +24,7 @@ from wm_nodes.video_rl.sampling import (
     drawn_history,
     recorded_place,
 )
-from wm_nodes.video_rl.train import post_train
+from wm_nodes.video_rl.train import post_train, sample_buffers
 from wm_nodes.video_rl.validation import WATCHED, context_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
@@ -127,7 +127,7 @@ def test_a_group_is_trained_and_evaluated_by_closeness_where_no_recording_has_si
     folder, probe = make_folder(), PositionProbe(8, 12)
     source = RecordedContexts(folder, blind, config, probe)
     learner = GrpoLearner(folder.network, config.grpo, config.rollout, seed=0)
-    (buffer, report), = post_train(learner, source, 1)
+    (buffer, report), = post_train(learner, sample_buffers(source, learner, 1))
     request = source.request(0, 0)
     frames, given = folder.codec.decode(buffer.rollout.latents), buffer.condition.num_conditioning
     wanted = score_pictures(frames, source.references(request), folder.codec, given)

@@ -38,7 +38,7 @@ from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.pretraining import make_video_model
 from wm_nodes.video_rl.sampling import RecordedContexts
 from wm_nodes.video_rl.toy_scene import NETWORK, ToyContexts, draw_scenes, load_base, training_batch
-from wm_nodes.video_rl.train import post_train
+from wm_nodes.video_rl.train import post_train, sample_buffers
 from wm_nodes.video_rl.training_run import VideoRun, progress
 from wm_nodes.video_rl.validation import context_scores
 from wm_nodes.world_model.position_probe import PositionProbe
@@ -125,7 +125,7 @@ def test_the_toy_is_sampled_scored_trained_saved_and_evaluated_alike(
     def work(where: str) -> Found:
         source, found, path = ToyContexts(load_base(device=where), config), {}, tmp_path / f"{where}.safetensors"
         learner = learner_of(source)
-        for iteration, (buffer, report) in enumerate(post_train(learner, source, 2)):
+        for iteration, (buffer, report) in enumerate(post_train(learner, sample_buffers(source, learner, 2))):
             place = where if config.rollout.buffer_device == "model" else "cpu"
             assert buffer.rollout.states.device.type == buffer.condition.frames.device.type == place
             assert buffer.rewards["total"].device.type == buffer.valid.device.type == "cpu"

@@ -9,7 +9,7 @@ from wm_nodes.config.load import load_video_config
 from wm_nodes.video_rl import train
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.toy_scene import ToyContexts, draw_scenes, load_base, score
-from wm_nodes.video_rl.train import post_train
+from wm_nodes.video_rl.train import post_train, sample_buffers
 
 CONFIG = load_video_config("base", {
     "groups.contexts": 2, "groups.group_size": 3, "rollout.num_steps": 4, "rollout.shift": 3.0,
@@ -24,7 +24,7 @@ def make_learner() -> tuple[ToyContexts, GrpoLearner]:
 
 def test_each_buffer_is_sampled_by_the_newest_weights_scored_and_trained_on() -> None:
     (source, learner), (other, same) = make_learner(), make_learner()
-    found = list(post_train(learner, source, 2))
+    found = list(post_train(learner, sample_buffers(source, learner, 2)))
     assert [(buffer.iteration, buffer.policy_version) for buffer, _ in found] == [(0, 0), (1, 2)]
     for iteration, (buffer, report) in enumerate(found):
         request = other.request(iteration, same.version)

@@ -18,11 +18,14 @@ CLIP_MEASURES = ("tracking_path", "tracking", "object_cm", "tool_cm", "psnr_db")
 
 @dataclass(frozen=True)
 class Difference:
-    """Mean and 95 % interval over seeds of one measure: sampler - base, or after - before."""
+    """Mean over seeds of one measure: sampler - base, or after - before."""
 
     mean: float
+    """Over the seeds."""
     low: float
+    """Of the 95 % interval."""
     high: float
+    """Of the 95 % interval."""
 
     @property
     def separable(self) -> bool:
@@ -31,12 +34,16 @@ class Difference:
 
 @dataclass(frozen=True)
 class SamplerComparison:
-    """sampler against base on their common seeds; differences: one per measure."""
+    """A sampler against another one on their common seeds."""
 
     sampler: str
+    """Its name."""
     base: str
+    """The name of the other."""
     seeds: tuple[int, ...]
+    """That both were trained at."""
     differences: dict[str, Difference]
+    """One per measure."""
 
 
 def compare_samplers(

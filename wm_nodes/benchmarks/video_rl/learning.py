@@ -13,7 +13,7 @@ from wm_nodes.core.device import device_of
 from wm_nodes.video_model import VideoNetwork
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.reward_hacking import find_hacked_metrics
-from wm_nodes.video_rl.train import Request, VideoLearner, post_train
+from wm_nodes.video_rl.train import Request, VideoLearner, post_train, sample_buffers
 from wm_nodes.video_rl.training_run import flatten_metrics
 
 MIN_EVALUATIONS = 4
@@ -38,7 +38,8 @@ def train_sampler(
         clocked(source, "request", "sample", "score", device=device) as rollout,
         clocked(learner, "train", device=device) as train,
     ):
-        for iteration, (buffer, report) in enumerate(post_train(learner, source, plan.iterations), 1):
+        training = post_train(learner, sample_buffers(source, learner, plan.iterations))
+        for iteration, (buffer, report) in enumerate(training, 1):
             buffers.append({**flatten_metrics(report), **source.measure(buffer)})
             if iteration % plan.eval_every == 0 or iteration == plan.iterations:
                 after = source.validate()

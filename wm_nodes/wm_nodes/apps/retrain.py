@@ -23,6 +23,7 @@ from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl import recorded_buffers
 from wm_nodes.video_rl.reference_reward import load_probe
+from wm_nodes.video_rl.train import post_train
 from wm_nodes.video_rl.training_run import VideoRun, progress
 from wm_nodes.video_rl.validation import validation_scores
 
@@ -78,9 +79,10 @@ def _run(
         heldout=validation_scores(folder, heldout, judge, config) if config.evaluation.every else None,
     )
     rewards = None if config.rewards == live.rewards else config.rewards
+    left = tqdm(clips[training.iterations :], desc="GRPO", unit="buffer")
     try:
-        for recorded in tqdm(clips[training.iterations :], desc="GRPO", unit="buffer"):
-            training.train(recorded_buffers.recorded_buffer(source, recorded, rewards))
+        for _ in post_train(training, (recorded_buffers.recorded_buffer(source, one, rewards) for one in left)):
+            pass
     finally:
         training.close()
     conclude(

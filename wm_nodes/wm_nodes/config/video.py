@@ -19,7 +19,9 @@ Anchor = Literal["buffer", "frozen", "lora_off", "dual"]
 
 class FlowMatchingConfig(SettingsSection):
     num_iterations: PositiveInt
+    """Optimizer steps."""
     learning_rate: PositiveFloat
+    """Of AdamW, after its warm-up."""
     drop: Fraction
     """Share of videos whose actions and instruction are hidden, for classifier-free guidance."""
     hide_actions: Fraction
@@ -37,8 +39,9 @@ class VideoModelConfig(SettingsSection):
     codec: Literal["patch", "tokenizer"]
     """patch: principal components of patches; tokenizer: the frozen tokenizer of the task's shipped world model."""
     patch: PositiveInt
+    """Codec `patch` only: side of a patch, px."""
     channels: PositiveInt
-    """Codec `patch` only: side of a patch, px, and how many components are kept."""
+    """Codec `patch` only: how many components are kept."""
     stride: PositiveInt
     """Recorded steps between two frames."""
     num_conditioning: NonNegativeInt
@@ -46,11 +49,13 @@ class VideoModelConfig(SettingsSection):
     text_dim: NonNegativeInt
     """Values per hashed word of the instruction."""
     width: PositiveInt
+    """Of the network's layers."""
     depth: PositiveInt
-    """Of the network."""
+    """Residual blocks of the network."""
     batch_size: PositiveInt
     """Clips per training step."""
     training: FlowMatchingConfig
+    """By flow matching."""
 
     @model_validator(mode="after")
     def _cuts_something(self) -> Self:
@@ -77,6 +82,7 @@ class VideoEvaluationConfig(SettingsSection):
     """Held-out contexts, one ODE clip each, before, during and after training."""
 
     contexts: PositiveInt
+    """Of the held-out ones, the first so many."""
     num_steps: PositiveInt
     """Sampler steps."""
     every: NonNegativeInt
@@ -136,11 +142,13 @@ class RolloutConfig(SettingsSection):
     """How videos are sampled."""
 
     num_steps: PositiveInt
+    """Of the sampler."""
     shift: PositiveFloat
     """Of the flow times towards the noise; 1: none."""
     cfg: float
     """Classifier-free guidance g of v_u + g (v_c - v_u); 1: off."""
     sampler: SamplerConfig
+    """What a step draws from."""
     storage_dtype: Literal["float32", "bfloat16"]
     """Of the kept latents; a state is rounded to it before its log-probability is taken."""
     noise_store: Literal["zeta", "zeta_bfloat16"]
@@ -193,13 +201,17 @@ class GrpoConfig(SettingsSection):
     """ratio: GRPO, by the likelihoods of sampled steps. nft: DiffusionNFT, by noise added to the final clips, from any
     sampler; what is said of ratios, clips and steps below then has no effect."""
     nft: NftConfig
+    """Of objective nft."""
     advantage: AdvantageConfig
+    """What a reward is worth beside those of its group."""
     kl: KlConfig
+    """Distance to an anchor, which is added to the loss."""
     trains: Literal["all", "condition"]
     """Every parameter that asks for a gradient, or those that carry the condition alone."""
     clip_low: NonNegativeFloat
-    clip_high: NonNegativeFloat
     """The probability ratio is clipped to [1 - clip_low, 1 + clip_high]."""
+    clip_high: NonNegativeFloat
+    """See clip_low."""
     logprob_weight: Literal["full", "cps", "base"]
     """Weight of an element in the ratio (DD-14c)."""
     updates_per_buffer: PositiveInt
@@ -213,8 +225,11 @@ class GrpoConfig(SettingsSection):
     micro_batch: PositiveInt
     """Transitions per network call."""
     learning_rate: NonNegativeFloat
+    """Of AdamW."""
     weight_decay: NonNegativeFloat
+    """Of AdamW."""
     max_grad_norm: PositiveFloat
+    """A longer gradient is scaled to it."""
     ema_decay: Annotated[float, Field(ge=0, lt=1)]
     """Decay of the average of the weights that is evaluated; 0: none."""
     max_staleness: NonNegativeInt
@@ -238,7 +253,9 @@ class VideoRlConfig(SettingsSection):
     """Everything of a run of loop 2."""
 
     seed: NonNegativeInt
+    """Of every random number."""
     task: TaskName
+    """Whose episodes contexts are taken from."""
     device: DeviceName
     """Of the video model, its codec, the rewards and the learner."""
     iterations: NonNegativeInt
@@ -255,12 +272,19 @@ class VideoRlConfig(SettingsSection):
     `ssim`, `perceptual`, `psnr_db`, `scenery` need no simulator state; or `agent`, which needs a judge. Several are
     added, e.g. {outcome: 0.5, agent: 0.5}."""
     judge: JudgeConfig
+    """Where the agent is among the rewards."""
     model: VideoModelConfig
+    """What is trained."""
     groups: GroupConfig
+    """What is sampled for a buffer."""
     evaluation: VideoEvaluationConfig
+    """On held-out contexts."""
     window: WindowConfig
+    """Of stochastic sampler steps."""
     rollout: RolloutConfig
+    """How it is sampled."""
     grpo: GrpoConfig
+    """How it is learned from."""
 
     @model_validator(mode="after")
     def _knows_its_conditions(self) -> Self:

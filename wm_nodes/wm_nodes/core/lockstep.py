@@ -23,6 +23,7 @@ class Rewards:
     session: int
     """Of the environment that published the lock-step."""
     step_id: int
+    """Of that lock-step."""
     stamp_ns: int
     """That of the lock-step."""
     total: FloatArray
@@ -34,6 +35,7 @@ class Rewards:
     components: FloatArray
     """(N, R), weighted."""
     component_names: tuple[str, ...]
+    """R names, e.g. dense and sparse."""
     success: UInt8Array
     """(N,), 0 no, 1 yes, 2 unknown."""
     valid: BoolArray
@@ -55,6 +57,7 @@ class Goals:
     """The goals of all environments, published when one of them changes."""
 
     stamp_ns: int
+    """Of the observation that the goals belong to."""
     images: UInt8Array | None
     """(N, H, W, 3); None where the environment has no goals."""
     found: BoolArray
@@ -114,6 +117,7 @@ class LockStep:
     goals: tuple[UInt8Array, BoolArray] | None = None
     """Goal images (N, H, W, 3) and whether each was found (N,); None without any."""
     rewards: Rewards | None = None
+    """What the evaluator said; None where it is not joined yet, or lost."""
 
     @property
     def key(self) -> StepKey:

@@ -30,6 +30,7 @@ from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import BufferReport
 from wm_nodes.video_rl.reference_reward import attach_rewards
+from wm_nodes.video_rl.train import post_train
 from wm_nodes.video_rl.training_run import VideoRun
 from wm_nodes.video_rl.validation import alarm_text, validation_scores
 
@@ -95,17 +96,19 @@ class VideoLearnerNode(TrainingNode):
         else:
             self._start_barrier.wait(work)
             source = self._sample_buffers(work, count)
+        self._video.check = work.check
         with closing(source) as buffers:
-            for done, buffer in enumerate(buffers, 1):
-                invalid = len(buffer) - int(buffer.valid.sum())
-                if invalid:
-                    self.diagnostics.count("invalid_rewards", invalid, text=f"{invalid} clips without reward")
-                report = self._video.train(buffer, work.check)
+            for done, (_, report) in enumerate(post_train(self._video, map(self._count_invalid, buffers)), 1):
                 if report.skipped:
                     self.diagnostics.count("skipped_buffers", text="no group of a buffer has rewards that differ")
                 self.announce()
                 self._send_feedback(work, report, done, count)
                 self._warn_of_hacking()
+
+    def _count_invalid(self, buffer: RolloutBuffer) -> RolloutBuffer:
+        if invalid := len(buffer) - int(buffer.valid.sum()):
+            self.diagnostics.count("invalid_rewards", invalid, text=f"{invalid} clips without reward")
+        return buffer
 
     def _read_buffers(self, uris: Sequence[str]) -> Generator[RolloutBuffer]:
         for uri in uris:

@@ -1,7 +1,6 @@
 """Record episodes and live graphs into rosbag2 (MCAP) bags, read them back, recover killed recordings."""
 
 from wm_nodes.recording.bag import Bag
-from wm_nodes.recording.dataset import load_dataset
 from wm_nodes.recording.errors import BagError, RecordingError
 from wm_nodes.recording.raw import RawBagWriter
 from wm_nodes.recording.reader import BagReport, check_spec, read_episodes, read_spec
@@ -10,6 +9,6 @@ from wm_nodes.recording.rollouts import read_rollouts
 from wm_nodes.recording.writer import EpisodeBagWriter
 
 __all__ = [
-    "Bag", "BagError", "BagReport", "EpisodeBagWriter", "RawBagWriter", "RecordingError", "check_spec", "load_dataset",
+    "Bag", "BagError", "BagReport", "EpisodeBagWriter", "RawBagWriter", "RecordingError", "check_spec",
     "read_episodes", "read_rollouts", "read_spec", "recover",
 ]

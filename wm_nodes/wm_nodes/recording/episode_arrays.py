@@ -16,25 +16,31 @@ TaskLabels = Callable[[str, FloatArray], BoolArray]
 
 @dataclass(frozen=True)
 class EpisodeArrays:
-    """E episodes padded to T steps by repeating their last frame; only the first `lengths` steps are real.
-
-    images: uint8 (E, T + 1, H, W, 3). states: float32 (E, T + 1, S), of the tool. actions: float32 (E, T, A), 0 where
-    padded. ground_truth: float32 (E, T + 1, P). success: bool (E, T + 1, J), column j for tasks[j], see `labelled`.
-    lengths: int64 (E,). recorded_tasks: the task that each episode was recorded for, with its instruction; where the
-    state says which task it is (Task.parts), that one. seeds: of their resets; () where unknown.
-    """
+    """E episodes padded to T steps by repeating their last frame; only the first `lengths` steps are real."""
 
     images: UInt8Array
+    """(E, T + 1, H, W, 3)."""
     states: FloatArray
+    """(E, T + 1, S), of the tool."""
     actions: FloatArray
+    """(E, T, A), 0 where padded."""
     ground_truth: FloatArray
+    """(E, T + 1, P)."""
     success: BoolArray
+    """(E, T + 1, J), column j for tasks[j], see `labelled`."""
     lengths: NDArray[np.int64]
+    """(E,), real steps."""
     tasks: tuple[str, ...]
+    """The J tasks that success is about."""
     instructions: tuple[str, ...]
+    """(E,)."""
     behaviours: tuple[str, ...]
+    """(E,), who acted."""
     recorded_tasks: tuple[str, ...]
+    """(E,), the task that each was recorded for, with its instruction; where the state says which task it is
+    (Task.parts), that one."""
     seeds: tuple[int, ...] = ()
+    """(E,), of their resets; () where unknown."""
 
     def __len__(self) -> int:
         return len(self.images)

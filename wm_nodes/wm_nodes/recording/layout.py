@@ -10,12 +10,16 @@ from wm_nodes.core.types import UInt8Array
 
 @dataclass(frozen=True)
 class Tiles:
-    """Tile i lies at row i // cols, column i % cols; missing tiles are black. Sizes in px."""
+    """Tile i lies at row i // cols, column i % cols; missing tiles are black."""
 
     rows: int
+    """Rows of tiles."""
     cols: int
+    """Columns of tiles."""
     tile_height: int
+    """Height of one tile, px."""
     tile_width: int
+    """Width of one tile, px."""
 
     @classmethod
     def of(cls, num_envs: int, height: int, width: int) -> "Tiles":

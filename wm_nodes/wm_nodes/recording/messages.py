@@ -5,6 +5,7 @@ What is decoded is a view of the message's bytes, no copy. WireError refuses wha
 """
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -87,7 +88,7 @@ def image_message(mosaic: UInt8Array, time_ns: int, *, encoding: str = "rgb8") -
 def array_of(field: Any, dtype: DTypeLike, shape: Sequence[int], name: str) -> NDArray[Any]:
     """A view of a message's array field in a shape. Raises WireError(BAD_SHAPE) where the length differs."""
     values = np.asarray(field, dtype)
-    if values.size != int(np.prod(shape)):
+    if values.size != math.prod(shape):
         raise WireError(BAD_SHAPE, f"{name} has {values.size} values, expected {tuple(shape)}; compare with env/spec")
     return values.reshape(shape)
 
@@ -155,16 +156,17 @@ def lockstep_of(message: Any, spec: EnvironmentSpec) -> LockStep:
 
 
 def lockstep_arrays(step: LockStep) -> dict[str, NDArray[Any]]:
-    """The array fields of wm_msgs/TransitionBatch, flat; bool as uint8."""
-    arrays = {name: np.ascontiguousarray(getattr(step, own)) for name, (own, _) in LOCKSTEP_ARRAYS.items()}
-    return {name: (v.view(np.uint8) if v.dtype == np.bool_ else v).reshape(-1) for name, v in arrays.items()}
+    """The array fields of wm_msgs/TransitionBatch, in our shapes."""
+    return {name: getattr(step, own) for name, (own, _) in LOCKSTEP_ARRAYS.items()}
 
 
 def lockstep_message(step: LockStep, seq: int) -> Any:
     """wm_msgs/TransitionBatch of a lock-step."""
+    arrays = {name: values.reshape(-1) for name, values in lockstep_arrays(step).items()}
+    arrays = {name: values.view(np.uint8) if values.dtype == np.bool_ else values for name, values in arrays.items()}
     return message_type("wm_msgs/msg/TransitionBatch")(
         header=header(step.stamp_ns, BASE_FRAME), session=step.session, seq=seq, next_stamp=stamp(step.next_stamp_ns),
-        step_id=step.step_id, num_envs=len(step.valid), source=step.source, **lockstep_arrays(step),
+        step_id=step.step_id, num_envs=len(step.valid), source=step.source, **arrays,
     )
 
 

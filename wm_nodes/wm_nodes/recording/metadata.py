@@ -17,21 +17,31 @@ class TopicInfo:
     """One recorded topic and its number of messages."""
 
     name: str
+    """Absolute."""
     msgtype: str
+    """E.g. wm_msgs/msg/EnvSpec."""
     type_hash: str
+    """RIHS01."""
     qos: tuple[Qos, ...]
+    """Of its publishers."""
     messages: int = 0
+    """How many there are."""
 
 
 @dataclass
 class FileInfo:
-    """One .mcap file of a bag. Times in ns; start_ns > end_ns while empty."""
+    """One .mcap file of a bag."""
 
     name: str
+    """Within the folder."""
     start_ns: int = 2**63 - 1
+    """Receive time of the first message; later than end_ns while there is none."""
     end_ns: int = 0
+    """Receive time of the last message."""
     messages: int = 0
+    """How many there are."""
     topic_messages: dict[str, int] = field(default_factory=dict)
+    """How many of each topic."""
 
     def count(self, topic: str, time_ns: int) -> None:
         self.start_ns = min(self.start_ns, time_ns)

@@ -22,17 +22,18 @@ EPISODE_FIELDS = (*POLICY_FIELDS, "ground_truth_names")
 
 @dataclass
 class BagReport:
-    """What a reader left out, and why. Filled while reading.
-
-    unfinished: episodes the recording cut off at its start or end. incomplete: one line per episode or rollout that
-    lost an image, a step or (rollouts) a reward. lost_steps: sequence numbers missing on env/transition.
-    """
+    """What a reader left out, and why. Filled while reading."""
 
     yielded: int = 0
+    """Episodes or rollouts that were given."""
     unfinished: int = 0
+    """Episodes that the recording cut off at its start or end."""
     incomplete: list[str] = field(default_factory=list)
+    """A line per episode or rollout that lost an image, a step or (rollouts) a reward."""
     lost_steps: int = 0
+    """Sequence numbers missing on env/transition."""
     missing_rewards: int = 0
+    """Steps without a valid reward in the episodes that were given."""
 
 
 @dataclass
@@ -40,14 +41,19 @@ class _Running:
     """An episode in progress in one environment slot."""
 
     session: int
+    """Of the environment."""
     episode_id: int
+    """Of the episode."""
     truth: FloatArray
     """(P,) of the first frame."""
     success: bool
     """At the first frame."""
     steps: list[LockStep] = field(default_factory=list)
+    """What was recorded of it, in order."""
     problem: str = ""
+    """Why it is incomplete; empty: it is not."""
     finished_at: int = 0
+    """Lock-steps of the bag before its end."""
 
 
 def read_spec(path: Path, *, namespace: str | None = None) -> EnvironmentSpec:

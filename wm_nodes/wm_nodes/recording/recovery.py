@@ -22,14 +22,18 @@ from wm_nodes.recording.storage import Note
 
 @dataclass(frozen=True)
 class RecoverReport:
-    """What came back. damaged: one line per unreadable chunk or end of a file, with its offset, and per topic that
-    cannot be copied."""
+    """What came back."""
 
     source: Path
+    """What was read."""
     bag: Path
+    """What was written."""
     messages: int
+    """How many came back."""
     topics: dict[str, int]
+    """How many of each topic."""
     damaged: list[str]
+    """A line per unreadable chunk or end of a file, with its offset, and per topic that cannot be copied."""
 
     def text(self) -> str:
         lines = [f"recovered {self.messages} messages of {self.source} into {self.bag}"]

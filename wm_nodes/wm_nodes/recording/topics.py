@@ -50,12 +50,16 @@ METRICS = _qos(depth=10)
 
 @dataclass(frozen=True)
 class RecordedTopic:
-    """name: relative to the namespace. sequenced: the message carries (session, seq), so that losses can be counted."""
+    """One row of the table."""
 
     name: str
+    """Relative to the namespace."""
     msgtype: str
+    """E.g. wm_msgs/msg/EnvSpec."""
     qos: Qos
+    """Of publishers, and in bags."""
     sequenced: bool = True
+    """Whether the message carries (session, seq), so that losses can be counted."""
 
 
 SPEC = RecordedTopic("env/spec", "wm_msgs/msg/EnvSpec", LATCHED)

@@ -29,50 +29,65 @@ ALL_TITLES = TITLES | UNREWARDED_TITLES
 
 @dataclass(frozen=True)
 class ScoreChange:
-    """One held-out score, means over the contexts. low, high: 95 % bootstrap interval of after minus before on the same
-    contexts. verdict: better or worse; empty where chance may explain it."""
+    """One held-out score."""
 
     before: float
+    """Mean over the contexts."""
     after: float
+    """Mean over the contexts."""
     difference: float
+    """After minus before, mean over the same contexts."""
     low: float
+    """Of its 95 % bootstrap interval."""
     high: float
+    """Of its 95 % bootstrap interval."""
     verdict: str
+    """better or worse; empty where chance may explain it."""
 
 
 @dataclass(frozen=True)
 class ClipSummary:
-    """The results of a run of loop 2.
-
-    scores: by name. contexts: held-out ones behind each. iterations: buffers trained on. version: optimizer steps.
-    weights: which ones were measured after, "averaged" or "last". unrewarded: as scores, of metrics that no reward can
-    weigh. executed: contexts behind those that begin with executed_. not_measured: why one of them is missing, by name.
-    evaluations: held-out ones made while training. watched: scores that the alarm of DD-2 compared in them. hacked:
-    evaluations with an alarm: step (buffers trained on), reward_slope, slopes by score, text; None: it never looked,
-    because there were fewer evaluations than evaluation.window.
-    bag: newest recording. minutes, command (as typed), machine (facts by name), date (year-month-day): of the call that
-        made the results.
-    """
+    """The results of a run of loop 2."""
 
     task: str
+    """By name."""
     preset: str
+    """That the settings began with."""
     seed: int
+    """Of every random number."""
     iterations: int
+    """Buffers trained on."""
     version: int
+    """Optimizer steps."""
     weights: str
+    """Which ones were measured after: averaged or last."""
     contexts: int
+    """Held-out ones behind each score."""
     scores: Mapping[str, ScoreChange]
+    """By name."""
     unrewarded: Mapping[str, ScoreChange] = field(default_factory=dict)
+    """As scores, of metrics that no reward can weigh."""
     executed: int = 0
+    """Contexts behind those that begin with executed_."""
     not_measured: Mapping[str, str] = field(default_factory=dict)
+    """Why one of them is missing, by name."""
     evaluations: int = 0
+    """Held-out ones made while training."""
     watched: Sequence[str] = ()
+    """Scores that the alarm of DD-2 compared in them."""
     hacked: Sequence[Mapping[str, Any]] | None = None
+    """Evaluations with an alarm: step (buffers trained on), reward_slope, slopes by score, text; None: it never looked,
+    because there were fewer evaluations than evaluation.window."""
     bag: str = ""
+    """Newest recording."""
     minutes: float = float("nan")
+    """Of the call that made the results."""
     command: str = ""
+    """That call, as typed."""
     machine: Mapping[str, str] = field(default_factory=dict)
+    """Facts by name."""
     date: str = ""
+    """Year-month-day of that call."""
 
 
 def clip_verdict(summary: ClipSummary) -> str:

@@ -13,12 +13,14 @@ from wm_nodes.reports.figures import COLOURS, add_legend, make_figure, save_figu
 
 @dataclass(frozen=True)
 class Panel:
-    """One diagram. lines: metric to its label in the legend, "" for none; "section/metric" takes it from that section
-    only. limits: fixed limits of the y axis."""
+    """One diagram."""
 
     title: str
+    """Above it."""
     lines: Mapping[str, str]
+    """Metric to its label in the legend, "" for none; "section/metric" takes it from that section only."""
     limits: tuple[float, float] | None = None
+    """Fixed ones of the y axis."""
 
 
 POLICY_PANELS = (

@@ -25,11 +25,14 @@ MARKS = {"passed": "good", "failed": "bad", "undecided": "faint"}
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG of the report. caption: what one sees in it."""
+    """A PNG of the report."""
 
     title: str
+    """Above it."""
     caption: str
+    """What one sees in it."""
     path: Path
+    """Of the file."""
 
 
 def write_report(run_dir: Path, summary: Summary, pictures: Sequence[Picture] = (), *, config_text: str = "") -> Path:

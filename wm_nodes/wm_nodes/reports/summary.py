@@ -18,12 +18,16 @@ OF_THE_CALL = ("minutes", "command", "machine", "date")
 
 @dataclass(frozen=True)
 class SuccessRate:
-    """Successes of `episodes` episodes; low, high: 95 % interval of the rate."""
+    """Successes of some episodes."""
 
     successes: int
+    """Of the episodes."""
     episodes: int
+    """At least 1."""
     low: float = 0.0
+    """Of the 95 % interval of the rate."""
     high: float = 1.0
+    """Of the 95 % interval of the rate."""
 
     def __post_init__(self) -> None:
         if self.episodes < 1 or not 0 <= self.successes <= self.episodes:
@@ -36,48 +40,55 @@ class SuccessRate:
 
 @dataclass(frozen=True)
 class Summary:
-    """The results of a run.
-
-    real_, imagined_: success before and after training, in evaluation.environment and in the world model; None where
-        evaluation.environment is none.
-    imagined_steps_per_s: environment steps of the training in the world model, per second of training.
-    bag: path of the recorded training, in the file relative to the run folder.
-    paired, imagined_paired: after minus before on the same seeds, with the keys difference, low and high (and more);
-        empty where not measured.
-    acceptance: AcceptanceReport.to_dict(). samples: environment steps trained on. minutes: of the whole run,
-    as first done. command: as typed. machine: facts by name.
-    exploit_meter: one mapping for each reading, in order: step (updates made before it) and the numbers of
-        policy_rl.exploit_meter.ExploitReading.metrics(). stopped: why training ended before all updates, by round.
-    by_task: of a task whose every episode is one of several, the real success of each: successes_before and _after,
-        episodes, difference, low and high.
-    reward: that the policy was trained for. judge: who gave it, where it is the agent's; else empty.
-    rounds: of a run in online rounds, one mapping for each: number, updates, samples, imagined_before, imagined, real
-        (successes, episodes, low, high, rate), verdict (accepted, reason, rows; empty after the last). The imagined
-        rates of a round are those of the model it trained in, so imagined_before and _after above may be of two models.
-    """
+    """The results of a run."""
 
     task: str
+    """By name."""
     preset: str
+    """That the settings began with."""
     seed: int
+    """Of every random number."""
     real_before: SuccessRate | None
+    """Success in evaluation.environment before training; None where that is none."""
     real_after: SuccessRate | None
+    """And after."""
     imagined_before: SuccessRate
+    """Success in the world model before training."""
     imagined_after: SuccessRate
+    """And after."""
     imagined_steps_per_s: float
+    """Environment steps of the training in the world model, per second of training."""
     bag: str
+    """Path of the recorded training, in the file relative to the run folder."""
     paired: Mapping[str, Any] = field(default_factory=dict)
+    """Real success after minus before on the same seeds: difference, low, high (and more); empty: not measured."""
     imagined_paired: Mapping[str, Any] = field(default_factory=dict)
+    """The same of imagined success."""
     acceptance: Mapping[str, Any] = field(default_factory=dict)
+    """AcceptanceReport.to_dict()."""
     samples: int = 0
+    """Environment steps trained on."""
     minutes: float = float("nan")
+    """Of the whole run, as first done."""
     command: str = ""
+    """As typed."""
     machine: Mapping[str, str] = field(default_factory=dict)
+    """Facts by name."""
     rounds: Sequence[Mapping[str, Any]] = ()
+    """Of a run in online rounds, in order: number, updates, samples, imagined_before, imagined, real (successes,
+    episodes, low, high, rate), verdict (accepted, reason, rows; empty after the last). The imagined rates of a round
+    are those of the model it trained in, so imagined_before and imagined_after above may be of two models."""
     exploit_meter: Sequence[Mapping[str, Any]] = ()
+    """Readings in order: step (updates made before) and the numbers of ExploitReading.metrics()."""
     stopped: Sequence[str] = ()
+    """Why training ended before all updates, by round."""
     by_task: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Of a task whose every episode is one of several, the real success of each: successes_before, successes_after,
+    episodes, difference, low and high."""
     reward: str = "endogenous"
+    """That the policy was trained for."""
     judge: str = ""
+    """Who gave it, where it is the agent's; else empty."""
 
 
 def write_summary(run_dir: Path, summary: Any) -> Path:
@@ -94,13 +105,12 @@ def write_summary(run_dir: Path, summary: Any) -> Path:
 
 
 def acceptance_outcome(report: Mapping[str, Any]) -> str:
-    """The outcome of an AcceptanceReport.to_dict(), or of one of its criteria; earlier versions had only `passed`."""
-    return str(report.get("outcome") or ("passed" if report["passed"] else "failed"))
+    """The outcome of an AcceptanceReport.to_dict(), or of one of its criteria."""
+    return str(report["outcome"])
 
 
 def read_summary(run_dir: Path) -> dict[str, Any]:
-    """The values of <run_dir>/summary.json, with the path of the bag as bag_path() says; `acceptance` is called gate in
-    older ones.
+    """The values of <run_dir>/summary.json, with the path of the bag as bag_path() says.
 
     Raises:
         FileNotFoundError: the run has not ended; names the file.
@@ -108,9 +118,9 @@ def read_summary(run_dir: Path) -> dict[str, Any]:
     path = Path(run_dir) / FILE_NAME
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: the run has not come to its end")
-    values = read_json(path, AGAIN)
+    values: dict[str, Any] = read_json(path, AGAIN)
     values["bag"] = bag_path(run_dir, values.get("bag", ""))
-    return {"acceptance" if name == "gate" else name: value for name, value in values.items()}
+    return values
 
 
 def as_first_made(run_dir: Path, summary: Any) -> Any:

@@ -13,17 +13,25 @@ from wm_nodes.reports.summary import SuccessRate, Summary
 
 @dataclass(frozen=True)
 class Cell:
-    """One rate as texts: "123 / 200", "61.5 %", "95 %: 54.6 to 68.0 %"."""
+    """One rate as texts."""
 
     count: str
+    """E.g. "123 / 200"."""
     percent: str
+    """E.g. "61.5 %"."""
     interval: str
+    """E.g. "95 %: 54.6 to 68.0 %"."""
 
 
 class ResultRow(NamedTuple):
+    """A line of the table of results."""
+
     label: str
+    """What was measured."""
     real: Cell
+    """In the simulator."""
     imagined: Cell
+    """In the world model."""
 
 
 def result_rows(summary: Summary) -> list[ResultRow]:

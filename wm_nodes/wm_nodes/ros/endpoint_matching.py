@@ -31,10 +31,15 @@ Ends = Callable[[str], set[str]]
 @dataclass(frozen=True)
 class _Peer:
     session: int
+    """Of the node."""
     active: bool
+    """Whether it is active."""
     publishes: frozenset[str]
+    """Its topics, absolute."""
     subscribes: frozenset[str]
+    """The topics that it listens to, absolute."""
     linked: frozenset[tuple[str, int]]
+    """The nodes, with their sessions, whose ends it has discovered."""
 
 
 class EndpointTable:

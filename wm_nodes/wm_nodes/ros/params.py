@@ -29,17 +29,24 @@ class ParameterError(ValueError):
 
 @dataclass(frozen=True)
 class Param:
-    """One parameter of a node. The type is the default's type; minimum and maximum are inclusive."""
+    """One parameter of a node."""
 
     name: str
+    """As on the command line."""
     default: bool | int | float | str | list[str]
+    """Its type is the type of the parameter."""
     description: str
+    """One plain sentence."""
     unit: str = ""
+    """Empty where it has none."""
     read_only: bool = False
     """True where a change would need a new configuration (shapes, files, seeds)."""
     minimum: float | None = None
+    """Inclusive; None: no bound."""
     maximum: float | None = None
+    """Inclusive; None: no bound."""
     choices: tuple[str, ...] = ()
+    """The values that are allowed; empty: all."""
 
     def descriptor(self) -> ParameterDescriptor:
         described = ParameterDescriptor(

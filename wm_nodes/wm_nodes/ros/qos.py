@@ -48,11 +48,14 @@ EVERY_NODE_DEPTH = 64
 
 @dataclass(frozen=True)
 class GraphTopic:
-    """One row of the table. name is relative (below the graph's namespace) unless it starts with '/'."""
+    """One row of the table."""
 
     name: str
+    """Relative, below the graph's namespace, unless it starts with '/'."""
     type: type[Any]
+    """Message class."""
     qos: QoSProfile
+    """Of publishers."""
 
     @property
     def reader_qos(self) -> QoSProfile:

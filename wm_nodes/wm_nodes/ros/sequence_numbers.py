@@ -47,18 +47,25 @@ class GapTracker:
     """
 
     session: int | None = None
+    """Of the newest message; None before any."""
     last_seq: int = -1
+    """Of that session."""
     received: int = 0
+    """Messages of all sessions."""
     lost: int = 0
     """Over all sessions."""
     repeated: int = 0
+    """Messages that were not newer than one before."""
     jumps: int = 0
     """Forward by more than MAX_GAP; one is believed when the next message goes on from there."""
     sessions: int = 0
+    """How many were seen."""
     gaps: list[tuple[int, int, int]] = field(default_factory=list)
     """(session, first missing seq, number of missing seqs), newest last; at most 1000 kept."""
     _last_seqs: dict[int, int] = field(default_factory=dict, repr=False)
+    """Newest number of each session."""
     _jumped_to: tuple[int, int] | None = field(default=None, repr=False)
+    """Where the newest jump went."""
 
     def observe(self, session: int, seq: int) -> int:
         """Note one message; return how many of its session were missed directly before it."""

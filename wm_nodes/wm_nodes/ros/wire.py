@@ -19,61 +19,88 @@ class Cancelled(Exception):
 
 @dataclass(frozen=True)
 class StepCommand:
-    """StepBatch's request. actions: (N * A,), row-major. Optional arrays: (N,) or None."""
+    """StepBatch's request."""
 
     session: int
+    """Of the environment, from the handshake."""
     step_id: int
+    """The next one, or the last one again."""
     spec_hash: str
+    """Of the spec that the caller was built for."""
     actions: FloatArray
+    """(N * A,), row-major, in [-1, 1]."""
     policy_version: int = 0
+    """Weights that chose the actions; 0: no numbered ones."""
     logprobs: FloatArray | None = None
+    """(N,) nats; None where unknown."""
     values: FloatArray | None = None
+    """(N,); None where unknown."""
     reset_mask: BoolArray | None = None
+    """(N,), reset instead of stepped; None: nobody."""
     reset_seeds: UInt64Array | None = None
+    """(N,); None: the environment draws them."""
     with_image: bool = True
+    """Whether the answer carries the images."""
 
 
 @dataclass(frozen=True)
 class ResetCommand:
-    """ResetBatch's request. Optional arrays: (N,) or None."""
+    """ResetBatch's request."""
 
     mask: BoolArray | None = None
+    """(N,), who is reset; None: all."""
     seeds: UInt64Array | None = None
+    """(N,); None: the environment draws them."""
     task: str = ""
+    """Must be the served one; empty: not checked."""
     behaviour: str = ""
+    """Label of the episode events; empty: as before."""
     with_image: bool = True
+    """Whether the answer carries the images."""
 
 
 @dataclass(frozen=True)
 class Reply:
-    """The answer to a step or a reset. images: (N, H, W, 3), or None when not asked for. step_s: s inside."""
+    """The answer to a step or a reset."""
 
     session: int
+    """Of the environment."""
     step_id: int
     """The step answered; after a reset the last one before it, so step_id + 1 comes next in both cases."""
     stamp_ns: int
+    """When the observation returned was made."""
     images: UInt8Array | None
+    """(N, H, W, 3); None when not asked for."""
     states: FloatArray
+    """(N, S)."""
     terminated: BoolArray
+    """(N,), the task is over."""
     truncated: BoolArray
+    """(N,), cut, or ended from outside until it is reset."""
     episode_ids: UInt64Array
+    """(N,), of the observation returned."""
     success_probability: FloatArray
+    """(N,), as in LockStep."""
     uncertainty: FloatArray
+    """(N,), as in LockStep."""
     step_s: float = 0.0
+    """Inside the environment, s."""
 
 
 @dataclass(frozen=True)
 class TimedAction:
-    """ActionBatch, for an environment that steps on its own clock. actions: (N * A,). logprobs, values: (N,) or None.
-
-    stamp_ns: of the observation it answers; 0: it answers none (a person's), and its age counts from arrival.
-    """
+    """ActionBatch, for an environment that steps on its own clock."""
 
     actions: FloatArray
+    """(N * A,), row-major."""
     stamp_ns: int
+    """Of the observation it answers; 0: it answers none (a person's), and its age counts from arrival."""
     policy_version: int = 0
+    """Weights that chose the actions; 0: no numbered ones."""
     logprobs: FloatArray | None = None
+    """(N,) nats; None where unknown."""
     values: FloatArray | None = None
+    """(N,); None where unknown."""
 
 
 @dataclass(frozen=True)
@@ -81,13 +108,24 @@ class EpisodeNote:
     """EpisodeEvent. Constants of the message are used for kind, outcome and reason."""
 
     stamp_ns: int
+    """Of the observation that it begins or ends with."""
     kind: int
+    """KIND_*."""
     env_index: int
+    """Environment, from 0."""
     episode_id: int
+    """Of the episode."""
     seed: int
+    """Of its reset."""
     behaviour: str
+    """Who acts."""
     length: int
+    """Steps made."""
     outcome: int
+    """OUTCOME_*."""
     reason: int
+    """REASON_*, why it ended."""
     policy_version_first: int
+    """That chose its first action."""
     policy_version_last: int
+    """That chose its newest action."""

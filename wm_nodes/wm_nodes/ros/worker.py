@@ -10,11 +10,14 @@ from wm_nodes.ros.wire import Cancelled
 
 @dataclass
 class Work:
-    """One goal at work. request: the goal message; feedback(message) publishes feedback."""
+    """One goal at work."""
 
     request: Any
+    """The goal message."""
     feedback: Callable[[Any], None]
+    """Publishes a feedback message."""
     _stop: threading.Event
+    """Set when it must stop."""
     reason: str = ""
     """Why it must stop: "cancelled", "deactivated", ...; empty while it may go on."""
 

@@ -22,17 +22,20 @@ from wm_nodes.video_model.tokenizer_codec import Codec
 
 @dataclass(frozen=True)
 class Clips:
-    """frames: uint8 (E, F, H, W, 3). actions: (E, F - 1, stride A), the recorded actions between two frames, one after
-    the other. ground_truth: (E, F, P) simulator state of `task`, NaN where unknown. instructions: one each. seeds: of
-    the simulator's reset, one each; () where unknown.
-    """
+    """Recorded episodes as clips of one length."""
 
     frames: Tensor
+    """uint8 (E, F, H, W, 3)."""
     actions: Tensor
+    """(E, F - 1, stride A), the recorded actions between two frames, one after the other."""
     ground_truth: FloatArray
+    """(E, F, P) simulator state of `task`, NaN where unknown."""
     instructions: tuple[str, ...]
+    """One each."""
     task: str
+    """Of all of them."""
     seeds: tuple[int, ...] = ()
+    """Of the simulator's reset, one each; () where unknown."""
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -14,14 +14,15 @@ from wm_nodes.core.seeding import torch_stream
 
 @dataclass(frozen=True)
 class Condition:
-    """frames: clean latents of the first K >= 0 frames (B, C, K, H, W). actions: (B, F - 1, A), action f leads from
-    frame f to frame f + 1; A = 0 where they are hidden and the model chooses the motion. text: (B, L, E) embedded
-    instruction; E and L may be 0.
-    """
+    """What B videos are made of."""
 
     frames: Tensor
+    """Clean latents of the first K >= 0 frames (B, C, K, H, W)."""
     actions: Tensor
+    """(B, F - 1, A), action f leads from frame f to frame f + 1; A = 0 where they are hidden and the model chooses the
+    motion."""
     text: Tensor
+    """(B, L, E) embedded instruction; E and L may be 0."""
 
     @property
     def num_conditioning(self) -> int:

@@ -34,14 +34,17 @@ KINDS = {PatchCodec: "patch", TokenizerCodec: "tokenizer"}
 
 @dataclass(frozen=True)
 class VideoFolder:
-    """clip: how episodes are cut, {"stride": recorded steps between frames, "num_conditioning": given frames}, and of a
-    model that goes on from its own frames {"given_frames", "new_frames": at most}.
-    """
+    """A video model, with what its folder says of it."""
 
     codec: Codec
+    """Pictures to latents and back."""
     network: VideoNetwork
+    """In evaluation mode."""
     clip: Mapping[str, int]
+    """How episodes are cut: stride (recorded steps between frames) and num_conditioning (given frames); of a model that
+    goes on from its own frames also given_frames and new_frames, at most."""
     manifest: Mapping[str, Any]
+    """How they were made."""
 
     @property
     def lengths(self) -> ClipLengths | None:

@@ -34,18 +34,23 @@ class VelocityModel(Protocol):
 
 @dataclass(frozen=True)
 class NetworkSettings:
-    """Latent channels, action values, text embedding values (0: none); width; residual blocks; patch side.
-    change_std: root mean square of a frame's change from the last given one, see _around_last_given; 0: the network's
-    output is the velocity itself.
-    """
+    """Sizes of the network."""
 
     channels: int
+    """Of the latents."""
     action_dim: int
+    """Values of an action."""
     text_dim: int = 0
+    """Values of an embedded word; 0: no text."""
     width: int = 64
+    """Of the hidden layers."""
     depth: int = 5
+    """Residual blocks."""
     patch: int = 2
+    """Side of the square of latent cells that is embedded together."""
     change_std: float = 0.0
+    """Root mean square of a frame's change from the last given one, see _around_last_given; 0: the network's output is
+    the velocity itself."""
 
 
 class VideoNetwork(nn.Module):

@@ -78,15 +78,20 @@ class SuccessReader(nn.Module):
 
 @dataclass(frozen=True)
 class ReaderScores:
-    """precision, recall: of `done`; NaN where nothing is done. rate, labelled: share that is read and that is done.
-    near_half: share that is done of pictures read as 0.4 to 0.6; NaN where there are none. count: pictures."""
+    """What a reader is good for on labelled pictures."""
 
     precision: float
+    """Of `done`; NaN where nothing is read as done."""
     recall: float
+    """Of `done`; NaN where nothing is done."""
     rate: float
+    """Share that is read as done."""
     labelled: float
+    """Share that is done."""
     near_half: float
+    """Share that is done of pictures read as 0.4 to 0.6; NaN where there are none."""
     count: int
+    """Pictures."""
 
 
 def train_success_reader(

@@ -27,21 +27,24 @@ Interval = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Headroom:
-    """Groups of continuations after `clips - 1` self-made clips.
-
-    reward: mean of a clip; best: of the best of n; gain: best - mean; spread: standard deviation within a group;
-    codec: of the recording, decoded from its latents. object_cm, tool_cm: how much smaller the errors of the clip of
-    best reward are than a clip's; below 0: larger.
-    """
+    """Groups of continuations after `clips - 1` self-made clips."""
 
     clips: int
+    """Number of the clip, from 1."""
     reward: float
+    """Mean of a clip."""
     best: float
+    """Mean of the best of n."""
     gain: Interval
+    """best - reward."""
     spread: float
+    """Standard deviation within a group."""
     codec: float
+    """Reward of the recording, decoded from its latents."""
     object_cm: Interval
+    """How much smaller the error of the clip of best reward is than a clip's; below 0: larger."""
     tool_cm: Interval
+    """The same."""
 
     @property
     def share(self) -> float:

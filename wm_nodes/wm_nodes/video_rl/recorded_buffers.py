@@ -32,26 +32,34 @@ from wm_nodes.world_model.position_probe import PositionProbe
 
 @dataclass(frozen=True)
 class RecordedClips:
-    """One ClipBatch with its ClipScores.
-
-    contexts: rows of the context bags' clips, one per clip (N,). scores, total: float64 (N,), NaN where missing. valid:
-    bool (N,). picture: uint8 (N H, F W, 3), or None where not read. weights: of the scores in the total. audit_ids: of
-    the agent's verdicts (N,), "" for a failed one; () where it was not called. judge_id: the judge's, "" without one.
-    """
+    """One ClipBatch of N clips with its ClipScores."""
 
     iteration: int
+    """Of the training."""
     policy_version: int
+    """Of the weights that sampled."""
     contexts: Tensor
+    """Rows of the context bags' clips, one per clip (N,)."""
     num_frames: int
+    """Of a clip."""
     uri: str
+    """Of the rollout buffer, in the run folder."""
     sha256: str
+    """Of that file."""
     scores: Mapping[str, Tensor]
+    """By name, float64 (N,), NaN where missing."""
     total: Tensor
+    """What trains, float64 (N,), NaN where missing."""
     valid: Tensor
+    """bool (N,)."""
     picture: UInt8Array | None
+    """uint8 (N H, F W, 3), or None where not read."""
     weights: Mapping[str, float] = field(default_factory=dict)
+    """Of the scores in the total."""
     audit_ids: tuple[str, ...] = ()
+    """Of the agent's verdicts (N,), "" for a failed one; () where it was not called."""
     judge_id: str = ""
+    """"" without a judge."""
 
     def frames(self, height: int, width: int) -> Tensor:
         """The clips, uint8 (N, F, H, W, 3), cut out of the picture.
@@ -73,18 +81,18 @@ class RecordedClips:
 
 @dataclass(frozen=True)
 class Rescored:
-    """A buffer scored again.
-
-    different: names of scores, `total`, `valid` or `verdicts` whose bits are not the recorded ones. same_reward: the
-    total was recorded with the same rewards; else it is not compared. verdicts: the agent's, where it was called; clips
-    without a recorded verdict are not compared.
-    """
+    """A buffer scored again."""
 
     recorded: RecordedClips
+    """What the bag holds."""
     total: Tensor
+    """Of now."""
     different: tuple[str, ...]
+    """Names of scores, `total`, `valid` or `verdicts` whose bits are not the recorded ones."""
     same_reward: bool = True
+    """The total was recorded with the same rewards; else it is not compared."""
     verdicts: tuple[Mapping[str, Any], ...] = ()
+    """The agent's, where it was called; clips without a recorded verdict are not compared."""
 
 
 @dataclass(frozen=True)

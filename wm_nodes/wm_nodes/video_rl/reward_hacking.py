@@ -11,11 +11,14 @@ T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
 @dataclass(frozen=True)
 class HackedMetric:
-    """One held-out metric that did not follow the training reward. Slopes are per evaluation, over the window."""
+    """One held-out metric that did not follow the training reward."""
 
     metric: str
+    """Its name."""
     proxy_slope: float
+    """The training reward's, per evaluation, over the window."""
     true_slope: float
+    """The metric's."""
 
 
 def find_hacked_metrics(

@@ -1,10 +1,9 @@
-"""Loop 2 on one screen: GRPO of a video model on groups of its own clips, in one process. The ROS graph is this loop
-with the video model, the reward evaluator and the learner in a process each, and gives the same weights bit for bit
-(tests/graph/test_world_model_rl.py). `python -m wm_nodes.video_rl.train` runs it, seconds per buffer: a video model
-whose disc goes the commanded way in 57 % of its clips learns to do so in two of three.
+"""Loop 2 on one screen: GRPO of a video model on groups of its own clips, in one process. The learner node runs it on
+clips of other processes, with the same weights bit for bit (tests/graph/test_world_model_rl.py). `python -m
+wm_nodes.video_rl.train` runs it, seconds per buffer: a disc goes as commanded in 57 % of clips, then in two of three.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Protocol, TypeVar
 
 from wm_nodes.config.load import load_video_config
@@ -32,16 +31,18 @@ class VideoLearner(Protocol):
     def train(self, buffer: RolloutBuffer) -> BufferReport: ...
 
 
-def post_train(
-    learner: VideoLearner, source: ClipSource[Request], iterations: int
-) -> Iterator[tuple[RolloutBuffer, BufferReport]]:
-    """Train on `iterations` buffers; yield each with the report of its optimizer steps."""
+def post_train(learner: VideoLearner, buffers: Iterable[RolloutBuffer]) -> Iterator[tuple[RolloutBuffer, BufferReport]]:
+    """Train on each buffer as it comes; yield it with the report of its optimizer steps."""
+    for buffer in buffers:
+        yield buffer, learner.train(buffer)  # learner.version is new from here on
+
+
+def sample_buffers(source: ClipSource[Request], learner: VideoLearner, iterations: int) -> Iterator[RolloutBuffer]:
+    """Buffers of fresh clips with their rewards, each sampled when it is asked for."""
     for iteration in range(iterations):
         request = source.request(iteration, learner.version)  # which contexts, and which weights sample
         clips = source.sample(request)  # a group of clips of each context
-        buffer = source.score(request, clips)  # a clip without reward is left out
-        report = learner.train(buffer)  # learner.version is new from here on
-        yield buffer, report
+        yield source.score(request, clips)  # a clip without reward is left out
 
 
 def main() -> None:
@@ -49,7 +50,7 @@ def main() -> None:
     config = load_video_config("base", {**changes, "grpo.learning_rate": 1e-4, "grpo.logprob_weight": "cps"})
     source = ToyContexts(load_base(device=compute_device(config.device)), config)
     learner = GrpoLearner(source.network, config.grpo, config.rollout, seed=config.seed)
-    for iteration, (_, report) in enumerate(post_train(learner, source, 20), 1):
+    for iteration, (_, report) in enumerate(post_train(learner, sample_buffers(source, learner, 20)), 1):
         obeyed = source.evaluate(draw_scenes(100, config.seed, "evaluation")).obeyed.mean()
         print(f"buffer {iteration}: training reward {report.reward_mean:.2f}; {obeyed:.0%} of held-out clips obey")
     print("acceptance of the video model: not judged: no policy can be trained in the toy")

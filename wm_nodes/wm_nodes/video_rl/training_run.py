@@ -83,6 +83,9 @@ class VideoRun(TrainingRun):
         self.staleness = 0
         """Optimizer steps between sampling and training of the last buffer."""
         self._metrics = MetricsWriter(run_dir, tensorboard=tensorboard) if self.ranks.rank == 0 else None
+        self.check: Callable[[], None] = lambda: None
+        """Called before every call of the network; what it raises ends the training with nothing changed. With several
+        ranks it is not called: one that stopped would leave the others waiting."""
         self.hacked: list[HackedMetric] = []
         """Metrics that the newest held-out evaluation finds hacked (DD-2)."""
 
@@ -104,12 +107,8 @@ class VideoRun(TrainingRun):
         """The version that samples the next buffer, number `iterations`."""
         return self.previous_version if self.prefetches else self.version
 
-    def train(self, buffer: RolloutBuffer, check: Callable[[], None] = lambda: None) -> BufferReport:
+    def train(self, buffer: RolloutBuffer) -> BufferReport:
         """Train on one buffer with rewards, or skip it (see GrpoLearner.train), then save.
-
-        Args:
-            check: called before every call of the network; what it raises ends the training with nothing changed. With
-                several ranks it is not called: one that stopped would leave the others waiting.
 
         Raises:
             As GrpoLearner.train; or OSError where saving fails: the training was then made; ensure_saved() tries again.
@@ -118,7 +117,7 @@ class VideoRun(TrainingRun):
             if self.ranks.size > 1 and self.ranks.rank == 0:
                 broadcast_bytes(buffer.to_bytes(), self.ranks)
             before, self.staleness = self.version, self.version - buffer.policy_version
-            stops = self.network.register_forward_pre_hook(lambda *_: check() if self.ranks.size == 1 else None)
+            stops = self.network.register_forward_pre_hook(lambda *_: self.check() if self.ranks.size == 1 else None)
             device, micro_batch = device_of(self.network), self.config.grpo.micro_batch
             with stops, explain_memory(device, grpo__micro_batch=micro_batch):
                 if self.config.rollout.buffer_device == "model":

@@ -58,6 +58,7 @@ class _Plan:
     """A lock-step that is allowed, before it is made."""
 
     command: StepCommand
+    """What was asked for."""
     actions: FloatArray
     """(N, A), checked."""
     resets: BoolArray

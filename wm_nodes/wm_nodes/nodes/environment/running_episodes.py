@@ -16,13 +16,19 @@ class _Slot:
     """The episode of one environment."""
 
     episode_id: int = 0
+    """Of the environment, from 1."""
     seed: int = 0
+    """Of its reset."""
     running: bool = False
+    """Whether it goes on."""
     aborted: bool = False
     """Ended from outside (estop, error, stop): nothing it does counts until it is reset."""
     length: int = 0
+    """Steps made."""
     version_first: int = 0
+    """Policy version of its first step."""
     version_last: int = 0
+    """Policy version of its newest step."""
 
 
 class RunningEpisodes:
@@ -72,7 +78,7 @@ class RunningEpisodes:
 
     def end(self, mask: BoolArray, reason: int, stamp_ns: int, *, abort: bool = False) -> None:
         """End what runs where mask is True. abort: nothing their environments do is valid until they are reset."""
-        for i in np.flatnonzero(mask & self.running).tolist():
+        for i in np.flatnonzero(mask & self.running).tolist() if mask.any() else ():
             self._end(i, EpisodeEvent.OUTCOME_UNKNOWN, reason, stamp_ns)
             self._slots[i].aborted = abort
 

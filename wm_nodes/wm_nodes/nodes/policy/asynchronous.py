@@ -28,12 +28,16 @@ CAPACITY = 8
 
 @dataclass(frozen=True)
 class SyncedObservation:
-    """One observation as the topics brought it. images: (N, H, W, 3). states: (N, S). step_id: of the next step."""
+    """One observation as the topics brought it."""
 
     stamp_ns: int
+    """When it was made."""
     step_id: int
+    """Of the next step."""
     images: UInt8Array
+    """(N, H, W, 3)."""
     states: FloatArray
+    """(N, S)."""
 
 
 class AsynchronousPolicy:
