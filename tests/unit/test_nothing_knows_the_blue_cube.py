@@ -8,12 +8,7 @@ ROOT = Path(__file__).parents[2] / "wm_nodes" / "wm_nodes"
 SIMULATOR = "environments/maniskill/"
 MAY_NAME_THE_SIMULATOR = {
     "environments/": "the room of simulators, robots and recordings of them",
-    "apps/": "what a person starts may choose it",
-    "launching/scenarios.py": "the value of an argument",
-    "nodes/factories.py": "the value of a parameter",
-    "policy_rl/acceptance.py": "replays what a policy did in the model",
-    "core/memory_limit.py": "the node that takes most memory, as measured",
-    "core/types.py": "an example",
+    "apps/train_policy.py": "names the value of a setting",
 }
 """Modules and folders whose text may hold `maniskill`, and why."""
 

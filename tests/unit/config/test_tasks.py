@@ -19,7 +19,7 @@ from wm_nodes.config.tasks import (
     VARIABLE,
     default_task,
     get_task,
-    is_simulated,
+    has_simulator,
     model_tasks,
     recorded_task,
     shares_scene,
@@ -38,8 +38,7 @@ TASKS = ("pull_cube", "push_cube", "reach")
 IN_SCENES = ("move_to_aim", "pick_place", "pull", "push", "reach_object")
 ALL = "all_tasks"
 """Those of the procedural scenes, and the one whose episodes are of all of them."""
-NAMED_IN = {"environments/maniskill/objects.py", "judge/clip_files.py", "apps/judge_clips.py",
-            "policy_rl/train.py"}
+NAMED_IN = {"environments/maniskill/objects.py", "judge/clip_files.py", "apps/judge_clips.py", "policy_rl/train.py"}
 """Those that share a model, two lines of clips.jsonl, an example."""
 
 
@@ -84,7 +83,7 @@ def test_a_robots_task_is_its_instruction_and_success_is_what_was_recorded(
     monkeypatch.setenv(VARIABLE, "robot_tasks")
     config = load_config("cpu", {"task": "fold"})
     assert get_task("fold").instruction == "fold the towel" and config.task == "fold"
-    assert not is_simulated("fold") and shares_scene("fold", "fold") and not shares_scene("reach", "fold")
+    assert not has_simulator("fold") and shares_scene("fold", "fold") and not shares_scene("reach", "fold")
     with pytest.raises(ValueError, match="'fold' has no `simulator` in its file"):
         simulation_spec("fold", config.simulation, 1)
     with pytest.raises(ValueError, match="'fold' has no success rule"):

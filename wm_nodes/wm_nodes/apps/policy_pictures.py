@@ -12,6 +12,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import success
 from wm_nodes.core.specs import SOURCE_SIMULATOR
 from wm_nodes.core.types import Environment, Episode, FloatArray, UInt8Array
+from wm_nodes.environments.registry import make_environment
 from wm_nodes.policy_rl.factories import models_of
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
@@ -49,9 +50,7 @@ def write_pictures(
 
     Writes PNGs to <run_dir>/pictures.
     """
-    from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-
-    environment = ManiSkillEnvironment(config.task, config.simulation, num_envs=1, seed=config.seed)
+    environment = make_environment(config, config.evaluation.environment, num_envs=1, seed=config.seed)
     try:
         episodes = [play(environment, policy, first_seed + i) for i in range(NUM_STRIPS)]
     finally:
@@ -121,7 +120,7 @@ def describe(pair: SideBySide, seed: int) -> str:
     imagined = f"done at step {pair.imagined_done}" if pair.imagined_done >= 0 else "not done"
     goal = "" if pair.goal is None else " Goal: what the text model imagines for the instruction."
     return (
-        f"Seed {seed}. Real: the trained policy in ManiSkill, {real}. Imagined: the same actions in the world model "
+        f"Seed {seed}. Real: the trained policy in the simulator, {real}. Imagined: the same actions in the model "
         f"from the same first frame, {imagined} (done signal up to {pair.signals.max():.2f}). Green frame: done.{goal}"
     )
 

@@ -212,7 +212,7 @@ def simulator_part(name: str) -> SimulatorPart:
     return part
 
 
-def is_simulated(name: str) -> bool:
+def has_simulator(name: str) -> bool:
     """Whether the simulator can show a task. False for no name."""
     return bool(name) and get_task(name).simulator is not None
 

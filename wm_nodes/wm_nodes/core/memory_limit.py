@@ -1,7 +1,7 @@
 """How much memory a process may take of its machine or container.
 
 What is limited is the data of a process: its heap and what else it may write and shares with nobody (RLIMIT_DATA).
-Address space is no measure of that: of the 2.9 GiB of the ManiSkill environment 0.7 are data, the rest is libraries,
+Address space is no measure of that: of the 2.9 GiB of the simulator's environment 0.7 are data, the rest is libraries,
 shared memory and room that is only reserved.
 """
 
@@ -14,7 +14,7 @@ GIB = 2**30
 SHARES = 8
 """A graph has up to eight processes, so none of them together can take all memory."""
 LEAST_GIB = 3.0
-"""Of a share; the largest node that was seen (the ManiSkill environment, 2026-11-27) took 0.7 GiB."""
+"""Of a share; the largest node that was seen (the simulator's environment, 2026-11-27) took 0.7 GiB."""
 CGROUPS = (("sys/fs/cgroup", "memory.max"), ("sys/fs/cgroup/memory", "memory.limit_in_bytes"))
 """Where version 2 and version 1 have their groups, and the file of one."""
 

@@ -56,7 +56,7 @@ class StepResult:
 
 
 class Environment(Protocol):
-    """N environments stepped together; served by the world model, by ManiSkill, or by a robot.
+    """N environments stepped together; served by the world model, by a simulator, or by a robot.
 
     An environment that has ended (terminated or truncated) stays put, with valid=False, until it is reset.
 

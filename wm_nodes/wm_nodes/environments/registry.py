@@ -9,6 +9,7 @@ from contextlib import closing
 from dataclasses import replace
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.tasks import has_simulator
 from wm_nodes.core.factory import load_factory
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Environment
@@ -17,8 +18,13 @@ from wm_nodes.environments.maniskill.spec import simulation_spec
 MANISKILL, GYMNASIUM = NAMES = ("maniskill", "gymnasium")
 
 
-def make_environment(config: RunConfig, name: str, *, num_envs: int, seed: int) -> Environment:
+def make_environment(
+    config: RunConfig, name: str, *, num_envs: int, seed: int, pictures: bool = True
+) -> Environment:
     """Return the environment of that name, of config.environment.factory or config.evaluation.environment.
+
+    Args:
+        pictures: False: where it can leave them black, it does; a step is then faster.
 
     Raises:
         ValueError: none can be made by the settings; says which.
@@ -28,7 +34,9 @@ def make_environment(config: RunConfig, name: str, *, num_envs: int, seed: int) 
         configured_task(config)
         from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 
-        environment = ManiSkillEnvironment(config.task, config.simulation, num_envs=num_envs, seed=seed)
+        environment = ManiSkillEnvironment(
+            config.task, config.simulation, num_envs=num_envs, seed=seed, pictures=pictures
+        )
     elif name == GYMNASIUM:
         from wm_nodes.environments.gymnasium_environment import gymnasium_environment
 
@@ -41,14 +49,14 @@ def make_environment(config: RunConfig, name: str, *, num_envs: int, seed: int) 
 
 
 def configured_spec(config: RunConfig, num_envs: int = 1) -> EnvironmentSpec:
-    """The spec of the configured task in its simulator; without a task that of environment.factory, of which one is
+    """The spec of the configured task in its simulator; where it has none that of environment.factory, of which one is
     made and closed again.
 
     Raises:
         ValueError: as make_environment.
     """
     name = config.environment.factory
-    if config.task or name == MANISKILL:
+    if has_simulator(config.task) or name == MANISKILL:
         return simulation_spec(configured_task(config), config.simulation, num_envs)
     with closing(make_environment(config, name, num_envs=1, seed=config.seed)) as environment:
         return replace(environment.spec, num_envs=num_envs)
@@ -66,4 +74,4 @@ def configured_task(config: RunConfig) -> str:
 
 def is_simulated(config: RunConfig) -> bool:
     """Whether episodes of the configured task can be played, planned and replayed, and policies are measured there."""
-    return bool(config.task) and config.evaluation.environment == MANISKILL
+    return has_simulator(config.task) and config.evaluation.environment == MANISKILL

@@ -105,7 +105,7 @@ class JudgeService:
 
     Args:
         tasks: of the clips, each of which is judged by the judge of its task, see for_task; (): the settings name the
-            judge of all. Clips of a task without a judge, or of another than these, have an ERROR that says so.
+            judge of all. On clips of a task without a judge the verdict is ABSTAIN and says so.
         reads: folder that keeps the judge's answers; None: none are kept.
         audit: folder of the audit log that every question, answer and verdict goes into; None: none is written.
         model_dir: world model whose normal ranges say how strange a clip is beside a server's answers; None: none does.
@@ -259,8 +259,12 @@ class JudgeService:
 
     async def _judge_clip(self, job: ClipJob, deadline: float | None) -> Verdict:
         agent = self._slot_of(job.task.task_id).agent
-        problem = job.problem or self._refused.get(job.task.task_id, "")
-        verdict = _unjudged(agent, job, self._seed, problem) if problem else await self._evaluate(agent, job, deadline)
+        if job.problem:
+            verdict = _unjudged(agent, job, self._seed, job.problem)
+        elif refusal := self._refused.get(job.task.task_id):
+            verdict = _unjudged(agent, job, self._seed, refusal, Status.ABSTAIN)
+        else:
+            verdict = await self._evaluate(agent, job, deadline)
         self.tally.add(verdict)
         return verdict
 
@@ -302,11 +306,13 @@ def _settings_by_task(
     return known or {"": settings}, refused
 
 
-def _unjudged(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int, reason: str) -> Verdict:
+def _unjudged(
+    agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int, reason: str, status: Status = Status.ERROR
+) -> Verdict:
     """The verdict on a clip that was not judged."""
     able, now = agent.judge.capabilities, time.time()
     verdict = Verdict(
-        clip_id=job.clip.clip_id, status=Status.ERROR, reward=math.nan, level=-1,
+        clip_id=job.clip.clip_id, status=status, reward=math.nan, level=-1,
         stages=tuple(map(skipped_stage, GATED)), plan=None, reflections=(), hack_flags=(), cost=Cost(),
         provenance=Provenance(
             able.judge_id, able.transport, able.model, able.server_version, agent.version, "", job.clip.sha256,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.environments.record import acceptance_plan, collect_plan, keep_plan
-from wm_nodes.environments.registry import is_simulated
+from wm_nodes.environments.registry import is_simulated, make_environment
 from wm_nodes.policy_rl.exploit_meter import IMAGINED_ENVS, imagine_and_replay
 from wm_nodes.policy_rl.factories import STARTS, make_imagined_environment, make_video_environment, models_of
 from wm_nodes.policy_rl.image_policy import ImagePolicy
@@ -62,8 +62,6 @@ def _roll_out(
     video_model_dir: Path | None,
 ) -> CloneRollouts | None:
     """Rollouts of the policy from the first frames of held-out episodes; None where acceptance.clone_episodes is 0."""
-    from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-
     if not config.acceptance.clone_episodes:
         return None
     starts = folder / STARTS
@@ -72,7 +70,7 @@ def _roll_out(
     seeds = load_start_seeds(starts, config.task)
     num_envs = min(len(seeds), IMAGINED_ENVS)
     env = make(config, video_model_dir or model_dir, starts, num_envs=num_envs, seed=config.seed)
-    simulator = ManiSkillEnvironment(config.task, config.simulation, pictures=False)
+    simulator = make_environment(config, config.evaluation.environment, num_envs=1, seed=0, pictures=False)
     try:
         return CloneRollouts(*imagine_and_replay(policy, env, simulator, seeds, config.seed))
     finally:

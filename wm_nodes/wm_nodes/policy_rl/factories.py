@@ -15,7 +15,7 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.config.tasks import is_simulated
+from wm_nodes.config.tasks import has_simulator
 from wm_nodes.core.cameras import CameraModel
 from wm_nodes.core.device import CPU, compute_device, explain_memory
 from wm_nodes.core.factory import load_factory
@@ -25,8 +25,8 @@ from wm_nodes.core.types import Environment, FloatArray, Observation, UInt8Array
 from wm_nodes.environments.cameras import simulated_cameras
 from wm_nodes.environments.registry import configured_spec, make_environment
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy, commanded_range
+from wm_nodes.policy_rl.learner import Learner
 from wm_nodes.policy_rl.ppo import PpoLearner
-from wm_nodes.policy_rl.training_run import Learner
 from wm_nodes.reward import EncoderDistance, EndogenousReward, RewardModel, RuleReward
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import load_weights_file
@@ -84,7 +84,7 @@ def chosen_model(config: RunConfig, folder: str = "") -> Path | None:
 def run_spec(config: RunConfig, model_dir: Path) -> EnvironmentSpec:
     """The environment of a run: of the configured task in its simulator, or where it has none the one that the world
     model was trained with. Raises ModelFolderError: the folder says none."""
-    if is_simulated(config.task):
+    if has_simulator(config.task):
         return configured_spec(config)
     return model_spec(model_dir, read_world_manifest(model_dir))
 
@@ -245,7 +245,7 @@ def make_device_environment(
 
 
 def _cameras(config: RunConfig, environment: ImaginedEpisodes) -> Sequence[CameraModel]:
-    if not is_simulated(config.task):
+    if not has_simulator(config.task):
         return ()
     return simulated_cameras(config.simulation, lambda env: environment.current().state[env])
 
