@@ -17,15 +17,16 @@ from pathlib import Path
 
 from setup import interpreter
 from setup.console import SetupError, isolated_environment, say
-from setup.stamp import fingerprint, finish, python_version, read_stamp, stamp_file
+from setup.stamp import fingerprint, finish, python_version, read_stamp, stamp_file, write_stamp
 
 ROOT = Path(__file__).resolve().parents[2]
 REQUIREMENTS = ROOT / "requirements"
 MESSAGES = ROOT / "msgs_schema"
 PACKAGE = ROOT / "wm_nodes"
 WORKSPACE = ROOT / "ros2_ws"
-SOURCES = "wm_setup_sources"
-"""File beside the built messages: the fingerprint of what they were built from, which comes along in a copy."""
+SOURCES = "wm_setup_sources.json"
+"""File beside the built messages, which comes along in a copy: the fingerprint of the contents that they were built
+from, and the folders that they name."""
 HELP = ("-h", "--help")
 MISSING = ":missing"
 """Suffix of the renderer's stamp where this user may not install system packages."""
@@ -96,14 +97,19 @@ def pending(venv):
     from setup.messages import lacks_tf
 
     stamp, wanted = read_stamp(stamp_file(venv)), _wanted(venv)
-    install = WORKSPACE / "install" / "wm_msgs"
-    built = (install / "share" / "wm_msgs" / "package.xml").exists() and (install / SOURCES).is_file()
     present = {
         "packages": (venv / "bin" / "python").exists(),
-        "messages": built and (install / SOURCES).read_text("utf-8") == wanted["messages"] and not lacks_tf(venv),
+        "messages": built_messages().get("messages") == wanted["messages"] and not lacks_tf(venv),
     }
     done = {step: stamp.get(step, "").split(":")[0] for step in wanted}
     return [step for step in wanted if not present.get(step, True) or done[step] != wanted[step]]
+
+
+def built_messages():
+    """What SOURCES holds; empty where there is no whole build."""
+    install = WORKSPACE / "install" / "wm_msgs"
+    whole = (install / "share" / "wm_msgs" / "package.xml").exists()
+    return read_stamp(install / SOURCES) if whole else {}
 
 
 def _wanted(venv):
@@ -135,23 +141,35 @@ def _set_up(venv):
         say(f"this checkout or its environment was in another folder: writing {ROOT} into {venv}")
         place.settle(venv, ROOT, log, before)
     wanted = _wanted(venv)
+    copied = "messages" not in read_stamp(stamp_file(venv)) and built_messages().get("messages") == wanted["messages"]
+    if copied:  # with the checkout, and not with the environment
+        made = built_messages()
+        place.settle(venv, ROOT, log, {name: made[name] for name in place.present(venv, ROOT)})
     if "renderer" in steps or "packages" in steps:
         ready = system.install(system.current_plan(), log)
         done["renderer"] = wanted["renderer"] + ("" if ready else MISSING)
     actions = {
         "packages": lambda: packages.install_packages(venv, REQUIREMENTS, log),
-        "messages": lambda: messages.build_messages(venv, WORKSPACE, log),
+        "messages": lambda: messages.build_messages(venv, WORKSPACE, log, built=copied),
         "wm_nodes": lambda: packages.install_editable(venv, PACKAGE, log),
     }
     for step, action in actions.items():
         if step in steps:
             action()
             if step == "messages":
-                (WORKSPACE / "install" / "wm_msgs" / SOURCES).write_text(wanted[step], encoding="utf-8")
+                _note_build(wanted, venv)
             finish(venv, {**done, step: wanted[step]})
     place.settle(venv, ROOT, log)
+    _note_build(wanted, venv)
     finish(venv, {**done, "place": wanted["place"], **place.present(venv, ROOT)})
     say("done")
+
+
+def _note_build(wanted, venv):
+    from setup import place
+
+    sources = {"messages": wanted["messages"], **place.present(venv, ROOT)}
+    write_stamp(WORKSPACE / "install" / "wm_msgs" / SOURCES, sources)
 
 
 def _recheck_renderer(venv):

@@ -58,8 +58,8 @@ def replace_file(path: Path, data: bytes) -> None:
     temporary.replace(path)
 
 
-def build_messages(venv: Path, workspace: Path, log: Path) -> None:
-    """Build ros2_ws/src/wm_msgs for the environment's Python, and tf2_msgs where that finds none.
+def build_messages(venv: Path, workspace: Path, log: Path, *, built: bool = False) -> None:
+    """Build ros2_ws/src/wm_msgs for the environment's Python, unless it is built, and tf2_msgs where that finds none.
 
     Raises SetupError with the compiler's last lines.
     """
@@ -75,13 +75,14 @@ def build_messages(venv: Path, workspace: Path, log: Path) -> None:
     if repair:
         say("the last build of wm_msgs did not finish: building it from the beginning")
     repair_cmake(venv / "share", include, numpy_include)
-    bases = {"wm_msgs": workspace}
+    bases = {} if built else {"wm_msgs": workspace}
     if lacks_tf(venv):
         (venv / "share" / TF).unlink()
     if (venv / TF).exists() or not output_of([str(python), "-c", FIND_TF], env):
         bases[TF] = venv / TF
-    tf = f", and {TF} for the frames of cameras" if TF in bases else ""
-    say(f"building wm_msgs, the message types of this project{tf} (1 to 3 minutes)")
+    about = {"wm_msgs": "wm_msgs, the message types of this project", TF: f"{TF} for the frames of cameras"}
+    if bases:
+        say(f"building {', and '.join(about[name] for name in bases)} (1 to 3 minutes)")
     for name in ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"):
         env[name] = str(venv)
     env.pop("COLCON_PREFIX_PATH", None)
@@ -101,7 +102,8 @@ def build_messages(venv: Path, workspace: Path, log: Path) -> None:
         command += ["--build-base", str(build.parent), "--install-base", str(install.parent)]
         command += ["--event-handlers", "console_direct+", "--cmake-args", *cmake]
         run(command, log=log, why=f"building {name}", env=env, cwd=workspace)
-    link_messages(venv, workspace.parent, [base / "install" / name for name, base in bases.items()])
+    installs = {workspace / "install" / "wm_msgs", *(base / "install" / name for name, base in bases.items())}
+    link_messages(venv, workspace.parent, sorted(installs))
 
 
 def link_messages(venv: Path, root: Path, installs: list[Path]) -> None:

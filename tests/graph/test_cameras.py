@@ -49,6 +49,7 @@ def pose_of(message: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
     return np.vstack([np.column_stack([rotation, [t.x, t.y, t.z]]), [0, 0, 0, 1]])
 
 
+@pytest.mark.slow
 def test_a_picture_and_its_calibration_have_one_stamp_and_one_frame(client: Client) -> None:
     infos: list[CameraInfo] = client.probe.listen("env/camera/hand/camera_info")
     first = wait_until("the latched calibration, before any observation", lambda: infos)[0]
@@ -203,6 +204,7 @@ def test_tf_has_the_frames_in_the_type_that_ros_2_itself_has_and_that_of_the_mos
     assert heard["type"] == ["tf2_msgs/msg/TFMessage", HASH]
 
 
+@pytest.mark.slow
 def test_without_tf2_msgs_a_camera_has_its_own_topics_alone(
     domain: int, probe: Probe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

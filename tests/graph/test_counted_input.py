@@ -59,6 +59,7 @@ BAD_MESSAGES: list[tuple[str, Callable[[EnvironmentSpec, int], Any], tuple[str, 
 """Topic, message, who reads it, their counter, and what their status says."""
 
 
+@pytest.mark.slow
 def test_a_bad_message_is_counted_by_every_reader_and_training_goes_on(graph: Graph, probe: Probe) -> None:
     graph.start_training_nodes()
     client = Client(probe)

@@ -19,6 +19,7 @@ PARAMS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
 def test_nodes_that_compute_refuse_a_gpu_that_is_not_there(domain: int, tmp_path: Path) -> None:
     graph = Graph(domain, tmp_path / "run", load_config("smoke", {"device": "cuda"}))

@@ -51,6 +51,7 @@ def client(graph: Graph, probe: Probe) -> Client:
     return Client(probe)
 
 
+@pytest.mark.slow
 def test_a_step_moves_the_state_by_the_scaled_action_and_publishes_image_and_transition(client: Client) -> None:
     images, transitions = client.probe.listen("env/image"), client.probe.listen("env/transition")
     wait_until("matching", lambda: client.probe.node.count_publishers("/wm/env/transition"))

@@ -37,6 +37,7 @@ from wm_nodes.world_model.starts import start_of
 pytestmark = pytest.mark.graph
 
 
+@pytest.mark.slow
 def test_evaluation_over_dds_equals_evaluation_in_one_process(graph: Graph, probe: Probe) -> None:
     policy = toy.make_policy(graph.config)
     save_weights(policy, graph.folder / "start.safetensors")
@@ -89,6 +90,7 @@ def start_composed(graph: Graph, params: dict[str, dict[str, Any]], *options: st
     graph.processes["composed"] = subprocess.Popen(command, env=graph.environment(), stdout=log, stderr=log)
 
 
+@pytest.mark.slow
 def test_a_composed_process_steps_by_direct_call_and_trains_to_the_same_weights(graph: Graph, probe: Probe) -> None:
     transitions = probe.listen("env/transition")
     start_composed(graph, {
@@ -115,6 +117,7 @@ def imagined(tmp_path: Path) -> dict[str, dict[str, Any]]:
     return {node: {"model_dir": str(model), **values} for node, values in params.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("advantage", ["gae", "group"])
 def test_device_rollouts_give_the_weights_of_policy_rl_train_and_leave_the_topics_of_steps_silent(
     graph: Graph, probe: Probe, imagined: dict[str, dict[str, Any]], advantage: str
@@ -146,6 +149,7 @@ def test_device_rollouts_give_the_weights_of_policy_rl_train_and_leave_the_topic
     wait_until("steps for whoever asks", lambda: transitions and transitions[-1].step_id == rollout.last_step_id)
 
 
+@pytest.mark.slow
 def test_a_policy_trains_in_a_video_model_to_the_weights_of_one_process(
     graph: Graph, probe: Probe, imagined: dict[str, dict[str, Any]], tmp_path: Path
 ) -> None:
@@ -198,6 +202,7 @@ def start_metered(
     return config, simulated
 
 
+@pytest.mark.slow
 def test_a_training_that_the_exploit_meter_stops_ends_with_its_reason_and_the_policy_as_it_is(
     graph: Graph, probe: Probe, imagined: dict[str, dict[str, Any]], tmp_path: Path
 ) -> None:
@@ -207,6 +212,7 @@ def test_a_training_that_the_exploit_meter_stops_ends_with_its_reason_and_the_po
     assert "after update 0 only" in result.message and "stop_precision is 1" in result.message, result.message
 
 
+@pytest.mark.slow
 def test_device_rollouts_refuse_a_reward_that_is_not_theirs_and_name_it(
     graph: Graph, probe: Probe, imagined: dict[str, dict[str, Any]]
 ) -> None:

@@ -18,6 +18,7 @@ pytestmark = pytest.mark.graph
 STEPS = 10
 
 
+@pytest.mark.slow
 def test_a_recorder_that_starts_last_has_every_message_of_the_first_rollout(graph: Graph, probe: Probe) -> None:
     graph.start_environment()
     graph.start_policy(await_nodes=["environment", "recorder"])

@@ -21,7 +21,7 @@ from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.starts import INSTRUCTIONS
 
 pytestmark = pytest.mark.graph
-SMALL = ["--preset", "smoke", *(f"--set={name}" for name in (
+SMALL = ["--preset", "smoke", *(f"--{name}" for name in (
     "acceptance.num_episodes=2", "acceptance.clone_episodes=2", "data.num_workers=1", "simulation.max_episode_steps=12"
 ))]
 RATES = ("real_before", "real_after", "imagined_before", "imagined_after")
@@ -32,8 +32,8 @@ def test_the_main_job_stops_at_acceptance_and_when_forced_leaves_summary_report_
     ros_domain: int, tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"
-    arguments = [*SMALL, "--set", "acceptance.tool_error_ratio=0.001", "--run-dir", str(run_dir),
-                 "--set", "exploit_meter.every=2", "--set", "exploit_meter.episodes=3"]
+    arguments = [*SMALL, "--acceptance.tool_error_ratio", "0.001", "--run-dir", str(run_dir),
+                 "--exploit_meter.every", "2", "--exploit_meter.episodes", "3"]
     refused = train_policy(arguments, ros_domain)
     assert refused.returncode == 3, refused.stdout + refused.stderr
     said = refused.stderr
@@ -75,7 +75,7 @@ def test_two_online_rounds_refresh_the_model_and_a_resumed_run_repeats_only_what
     model = make_model_folder(tmp_path / "model")
     write_some_starts(run_dir / "starts.safetensors")
     arguments = [*SMALL, "--force", "--rounds", "2", "--model-dir", str(model), "--run-dir", str(run_dir),
-                 "--set", "evaluation.episodes=2", "--compose"]
+                 "--evaluation.episodes", "2", "--compose"]
     done = train_policy(arguments, ros_domain)
     assert done.returncode == 0, done.stdout + done.stderr
     assert {path.name for path in run_dir.iterdir()} <= RUN_ENTRIES, "a peer may write what is not listed there"
@@ -110,8 +110,8 @@ def test_the_agent_pays_the_policy_and_the_run_goes_on_with_that_reward_only(
     run_dir = tmp_path / "run"
     write_some_starts(run_dir / "starts.safetensors")
     arguments = [*SMALL, "--force", "--model-dir", str(make_model_folder(tmp_path / "model")),
-                 "--run-dir", str(run_dir), "--set", "evaluation.episodes=2",
-                 "--set", "ppo.num_steps=12", "--set", "ppo.num_envs=3", "--compose"]
+                 "--run-dir", str(run_dir), "--evaluation.episodes", "2",
+                 "--ppo.num_steps", "12", "--ppo.num_envs", "3", "--compose"]
     with serving(PickyServer()) as server:
         agent = ["--reward", "agent", "--judge", server.url, "--judge-model", "judge"]
         done = train_policy([*arguments, *agent], ros_domain)
@@ -136,9 +136,9 @@ def test_the_agent_pays_the_policy_and_the_run_goes_on_with_that_reward_only(
 
 
 def test_a_wrong_setting_ends_with_one_clear_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert main(["train-policy", "--set", "ppo.updates=many", "--run-dir", str(tmp_path)]) == 2
+    assert main(["train-policy", "--ppo.updates", "many", "--run-dir", str(tmp_path)]) == 2
     error = capfd.readouterr().err
     assert "ppo.updates" in error and "many" in error and "Traceback" not in error
-    meter = ["--set", "exploit_meter.every=1", "--set", "evaluation.episodes=3"]
+    meter = ["--exploit_meter.every", "1", "--evaluation.episodes", "3"]
     assert main(["train-policy", *meter, "--run-dir", str(tmp_path)]) == 2
     assert "exploit_meter.episodes is 32, and this run has 24 first frames" in capfd.readouterr().err

@@ -29,7 +29,7 @@ from wm_nodes.reports.summary import read_summary
 from wm_nodes.world_model import DeviceEnvironment, load_model_folder
 from wm_nodes.world_model.validation.acceptance import accept_world_model
 
-pytestmark = pytest.mark.graph
+pytestmark = [pytest.mark.graph, pytest.mark.slow]
 STEPS = 120
 OWN = {
     "arm": {"environment.factory": "examples.own_environment:make"},
@@ -153,7 +153,7 @@ def test_train_policy_needs_no_task_and_says_where_nothing_real_was_measured(
     preset.write_text(dump_config(config), encoding="utf-8")
     done = train_policy([
         "--preset", str(preset), "--model-dir", str(model_dir), "--demos", str(bag), "--force",
-        "--set", f"evaluation.environment={measured_in}", "--set", "sft.num_demonstrations=2",
+        "--evaluation.environment", measured_in, "--sft.num_demonstrations", "2",
         "--run-dir", str(tmp_path / "run"),
     ], ros_domain)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -177,7 +177,7 @@ def test_train_policy_without_a_task_names_what_is_missing(
         ([], "task is empty; name a model of your recordings with --model-dir"),
         (["--model-dir", str(model_dir)], "task is empty; name recordings of demonstrations with --demos"),
         (["--model-dir", str(model_dir), "--demos", str(bag)], "task is empty, and environment maniskill simulates"),
-        (["--model-dir", str(model_dir), "--demos", str(bag), "--rounds", "2", "--set", "evaluation.environment=none"],
+        (["--model-dir", str(model_dir), "--demos", str(bag), "--rounds", "2", "--evaluation.environment", "none"],
          "--rounds 2 collect in the simulator"),
     ):
         assert main([*begun, *given]) == 2

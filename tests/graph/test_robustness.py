@@ -227,7 +227,7 @@ def test_a_full_disk_ends_training_as_failed_with_one_error_and_the_last_checkpo
 def test_the_main_job_without_a_renderer_ends_with_one_line(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    given = ["--preset", "smoke", "--run-dir", str(tmp_path / "run"), "--set", "simulation.render_device=cuda:77"]
+    given = ["--preset", "smoke", "--run-dir", str(tmp_path / "run"), "--simulation.render_device", "cuda:77"]
     assert main(["train-policy", *given]) == 2
     said = capfd.readouterr()
     assert "no renderer at cuda:77" in said.err and "Traceback" not in said.out + said.err

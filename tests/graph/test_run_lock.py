@@ -1,6 +1,5 @@
 """A run folder has one writer, also where two graphs never meet; a launch goes on from its folder alone."""
 
-import json
 import os
 import signal
 import subprocess
@@ -14,6 +13,7 @@ from run_holders import holder
 
 from wm_msgs.action import Train
 from wm_nodes.core.run_lock import NAME
+from wm_nodes.training.run_record import read_record
 
 pytestmark = pytest.mark.graph
 
@@ -76,11 +76,11 @@ def test_one_graph_at_a_time_writes_into_a_folder_and_a_launch_goes_on_from_it_a
                 assert result.termination_reason == Train.Result.FINISHED, result.message
             given = []
         assert result.updates == 2 and not (folder / NAME).exists()
-    assert json.loads((folders[0] / "launch.json").read_text())["online_training"] == dict(
-        text.split(":=") for text in begun
-    )
+    record = read_record(folders[0])
+    assert record is not None and record.preset == "smoke" and record.settings["seed"] == 5
+    assert record.options["online_training"]["num_envs"] == "6"
     files = [folder / "policies" / "policy_000003.safetensors" for folder in folders]
     assert files[0].read_bytes() == files[1].read_bytes()
     with own_domain() as other:
         text = refused([*starter, "seed:=6", "num_envs:=6", f"run_dir:={folders[0]}"], other)
-        assert "seed is '5' in this run, '6' is given" in text and "begin another run folder" in text
+        assert "seed is 5 in this run, 6 is given" in text and "begin another run folder" in text

@@ -6,13 +6,11 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from deadlines import within
-from graph.harness import removed_ports
 
 from wm_nodes.launching import readiness
 from wm_nodes.launching import runner as launching_runner
@@ -91,28 +89,6 @@ def test_death_by_sigkill_is_reported_within_five_seconds(ros_domain: int, forks
 
 @pytest.mark.parametrize("forks", [True, False])
 @pytest.mark.kills
-def test_killed_node_can_be_restarted_and_its_end_is_no_failure(ros_domain: int, forks: bool) -> None:
-    with Runner(graph(tiny("a"), tiny("b"), forks=forks), log=None) as runner:
-        runner.wait_ready(30)
-        first = runner.pid("a")
-        runner.kill("a")
-        assert runner.wait_ended("a") == -signal.SIGKILL
-        assert runner.failure() is None
-        runner.restart("a")
-        assert runner.pid("a") != first
-        try:
-            runner.wait_ready(30)
-        except NotReadyError as error:  # as in harness.Graph.restart
-            removed = removed_ports(runner.pid("a"))
-            if not removed:
-                raise
-            warnings.warn(f"a started once more: {error}; {removed} removed", stacklevel=2)
-            runner.restart("a")
-            runner.wait_ready(30)
-
-
-@pytest.mark.parametrize("forks", [True, False])
-@pytest.mark.kills
 def test_a_node_that_is_to_respawn_comes_back_and_one_that_ends_at_once_does_not(
     ros_domain: int, forks: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -142,17 +118,16 @@ def test_node_that_ignores_sigint_and_sigterm_is_killed_in_the_end(ros_domain: i
 
 
 @pytest.mark.kills
-def test_nodes_end_with_their_fork_server_and_start_again_without_it(ros_domain: int) -> None:
-    with Runner(graph(tiny("a"), tiny("b")), log=None) as runner:
+def test_nodes_end_with_their_fork_server_and_come_back_without_it(
+    ros_domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launching_runner, "LEAST_LIFE_S", 0.0)
+    with Runner(graph(*(replace(tiny(name), respawn=True) for name in "ab")), log=None) as runner:
         runner.wait_ready(30)
         pids = [runner.pid("a"), runner.pid("b")]
         assert parent(pids[0]) == parent(pids[1])
         os.kill(parent(pids[0]), signal.SIGKILL)
-        assert runner.wait(timeout_s=30) == 128 + signal.SIGTERM
-        for name in "ab":
-            runner.wait_ended(name)
-            runner.restart(name)
-        runner.wait_ready(30)
+        assert runner.wait(timeout_s=30, until=lambda: not {runner.pid("a"), runner.pid("b")} & {*pids}) == 0
         assert parent(runner.pid("a")) == os.getpid()
         assert not any(alive(pid) for pid in pids)
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from deadlines import within
 from graph import toy
 from graph.harness import Graph, Probe, own_domain, wait_until
@@ -19,7 +20,10 @@ from wm_msgs.action import Replay, Train
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import GetWeights, InferAction, SaveCheckpoint, StopRecording
 from wm_nodes.config.load import load_config
+from wm_nodes.policy_rl.train import train_policy
+from wm_nodes.reward import RuleReward
 from wm_nodes.ros import convert
+from wm_nodes.training.weights import unpack_weights
 
 pytestmark = pytest.mark.graph
 
@@ -103,6 +107,19 @@ def test_the_graph_gives_the_weights_of_policy_rl_train_bit_for_bit(settings: di
     assert len(graph_weights) == 3
     file = tmp_path / "graph" / "policies" / "policy_000003.safetensors"
     toy.assert_trained_in_one_process(file, updates=2, settings=settings)
+
+
+def test_a_learner_that_is_not_ppo_trains_and_resumes_over_dds_as_in_one_process(tmp_path: Path) -> None:
+    for updates in (2, 1):
+        _run(tmp_path, updates, settings={"learner.factory": "reinforce:make_reinforce"})
+    config = load_config(
+        "smoke", {"learner.factory": "graph.reinforce:make_reinforce", "ppo.num_envs": 4, "ppo.updates": 3}
+    )
+    policy, reward = toy.make_policy(config), RuleReward(config.reward.sparse_weight)
+    assert len(list(train_policy(policy, toy.ReachToy(4, seed=0), reward, config))) == 3
+    found, _ = unpack_weights((tmp_path / "policies" / "policy_000004.safetensors").read_bytes())
+    for name, tensor in policy.state_dict().items():
+        assert torch.equal(found[name], tensor), name
 
 
 def recorded_training(graph: Graph, probe: Probe, updates: int) -> Path:

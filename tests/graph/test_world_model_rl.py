@@ -44,7 +44,7 @@ from wm_nodes.world_model.position_probe import PositionProbe
 pytestmark = pytest.mark.graph
 PROGRAM = "import sys; from wm_nodes.apps.cli import main; sys.exit(main(['train-video-model', *sys.argv[1:]]))"
 SETTINGS = {"grpo.ema_decay": 0.5, "rewards.closeness": 0.5}
-ARGUMENTS = ["--preset", "smoke", *(f"--set={name}={value}" for name, value in SETTINGS.items())]
+ARGUMENTS = ["--preset", "smoke", *(f"--{name}={value}" for name, value in SETTINGS.items())]
 
 
 def start(arguments: list[str], domain: int) -> subprocess.CompletedProcess[str]:
@@ -219,7 +219,7 @@ def test_training_again_from_the_recording_gives_the_same_weights_and_other_rewa
         }
     scores = {name: row["after"] for name, row in read_summary(run_dir)["scores"].items()}
     assert {name: row["after"] for name, row in read_summary(tmp_path / "same")["scores"].items()} == scores
-    other = ["--run-dir", str(tmp_path / "other"), "--set", "rewards.object_cm=-0.1", "--no-tensorboard"]
+    other = ["--run-dir", str(tmp_path / "other"), "--rewards.object_cm", "-0.1", "--no-tensorboard"]
     assert main(["retrain", str(run_dir), *other]) == 0
     assert (tmp_path / "other" / VIDEO_FILES.uri(4)).read_bytes() != live["video_000004.safetensors"]
     assert read_metrics(tmp_path / "other", "grpo")[0]["reward_mean"] == pytest.approx(
@@ -323,7 +323,7 @@ def test_offline_work_on_a_folder_that_is_no_run_is_one_clear_line(
 
 
 def test_wrong_settings_end_with_one_clear_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert main(["train-video-model", "--set", "rollout.sampler.eta=1.2", "--run-dir", str(tmp_path)]) == 2
+    assert main(["train-video-model", "--rollout.sampler.eta", "1.2", "--run-dir", str(tmp_path)]) == 2
     said = "".join(capfd.readouterr())
     assert "eta must be in [0, 1] for dyndiff, got 1.2" in said and "Traceback" not in said
 
@@ -334,7 +334,7 @@ def test_the_launch_file_trains_a_given_model_on_given_recordings_and_records_it
 ) -> None:
     bags = ",".join(map(str, sorted((run_dir / "data" / "train").glob("shard_*"))))
     given = [
-        "video_preset:=smoke", f"video_model_dir:={run_dir / 'video_model'}", f"context_bags:={bags}",
+        "preset:=smoke", f"video_model_dir:={run_dir / 'video_model'}", f"context_bags:={bags}",
         f"run_dir:={tmp_path / 'run'}", f"domain_id:={domain}",
     ]
     operator = Probe(domain)
@@ -357,5 +357,5 @@ def test_settings_that_the_graphs_model_or_the_ratio_cannot_have_are_refused_bef
         ("grpo.objective=nft", "objective nft has no transitions, got kl.mode mean with kl.anchor dual"),
     ):
         run_dir = tmp_path / "run"
-        assert main(["train-video-model", "--set", setting, "--run-dir", str(run_dir)]) == 2
+        assert main(["train-video-model", f"--{setting}", "--run-dir", str(run_dir)]) == 2
         assert said in capfd.readouterr().err and not run_dir.exists()

@@ -16,8 +16,8 @@ from wm_nodes.core.cameras import CameraModel, Matrix, intrinsics, look_at
 from wm_nodes.core.specs import SOURCE_SIMULATOR, EnvironmentSpec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
-from wm_nodes.policy_rl.factories import make_learner
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
+from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.reward import RuleReward
 from wm_nodes.training.weights import pack_weights, unpack_weights
@@ -240,7 +240,7 @@ def make_slow_policy(config: RunConfig) -> ImagePolicy:
 
 def make_stuck_learner(policy: ImagePolicy, config: RunConfig) -> Any:
     """A learner whose update hears nobody for STUCK_S, as on a crowded machine."""
-    learner = make_learner(policy, config)
+    learner = PpoLearner(policy, config.ppo, seed=config.seed)
 
     def update(rollout: Any, **_more: Any) -> Any:
         print("stuck", flush=True)

@@ -13,7 +13,7 @@ from dataclasses import MISSING, dataclass, field, fields
 from importlib import import_module
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, Self, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin, get_type_hints
 
 import torch
 from rich.console import Console
@@ -156,7 +156,7 @@ def _argument(kind: Any, default: Any) -> dict[str, Any]:
     asked: dict[str, Any] = {"required": True} if default is MISSING else {"default": default}
     if get_origin(kind) is tuple:
         kind, asked["nargs"] = get_args(kind)[0], "+"
-    if get_origin(kind) is UnionType:
+    if get_origin(kind) in (Union, UnionType):
         kind = next(part for part in get_args(kind) if part is not type(None))
     if get_origin(kind) is Annotated:
         kind = kind.__metadata__[0]

@@ -1,7 +1,7 @@
 """An arm of your own, here one that a few lines simulate; see environments/batch.py and core/specs.py.
 
-python -m wm_nodes.policy_rl.train --task "" --set environment.factory=examples.own_environment:make
-    --set policy.factory=wm_nodes.policy_rl.factories:untrained_policy --preset smoke --set ppo.num_steps=16 --updates 3
+python -m wm_nodes.policy_rl.train --task "" --environment.factory examples.own_environment:make
+    --policy.factory wm_nodes.policy_rl.factories:untrained_policy --preset smoke --ppo.num_steps 16 --updates 3
 """
 import numpy as np
 

@@ -1,7 +1,7 @@
 """A learner of your own, regression on the actions that were paid best; see Learner in policy_rl/training_run.py.
 
-python -m wm_nodes.policy_rl.train --set learner.factory=examples.own_learner:BestActionsLearner
-    --preset smoke --updates 3 --set ppo.num_steps=16
+python -m wm_nodes.policy_rl.train --learner.factory examples.own_learner:BestActionsLearner
+    --preset smoke --updates 3 --ppo.num_steps 16
 """
 from collections.abc import Callable
 from pathlib import Path

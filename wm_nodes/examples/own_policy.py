@@ -1,7 +1,7 @@
 """A policy that sees by an encoder of your own instead of the world model's tokenizer; see policy_rl/image_policy.py.
 
-python -m wm_nodes.policy_rl.train --set policy.factory=examples.own_policy:make
-    --preset smoke --updates 3 --set ppo.num_steps=16
+python -m wm_nodes.policy_rl.train --policy.factory examples.own_policy:make
+    --preset smoke --updates 3 --ppo.num_steps 16
 """
 import torch
 from torch import Tensor, nn

@@ -1,7 +1,7 @@
 """A reward of your own; see reward/base.py.
 
-python -m wm_nodes.policy_rl.train --set reward.factory=examples.own_reward:make
-    --preset smoke --updates 3 --set ppo.num_steps=16
+python -m wm_nodes.policy_rl.train --reward.factory examples.own_reward:make
+    --preset smoke --updates 3 --ppo.num_steps 16
 """
 import numpy as np
 

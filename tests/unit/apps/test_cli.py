@@ -15,21 +15,22 @@ from wm_nodes.apps import cli
 from wm_nodes.core.errors import ModelNotAcceptedError, RunError
 
 OPTIONS = {
-    "train-policy": "--preset --set --device --task --seed --run-dir --model-dir --from-scratch --force --rounds "
-    "--environment --video-model --reward --judge --judge-model --judge-key-env --rubric --compose --domain-id "
-    "--verbose",
-    "train-video-model": "--preset --set --seed --run-dir --from-scratch --bags --heldout-bags --keep-buffers --reward "
-    "--judge --judge-model --judge-key-env --rubric --tensorboard --no-tensorboard --domain-id --verbose",
-    "check-video-model": "--video-model --context-bags --public --prompt --picture --size --lora-rank --preset --set",
-    "seed-study": "--tasks --seeds --arms --preset --set --device --model-dir --threads --out",
-    "collect": "folder --tasks --episodes --first-seed --preset --set --device",
+    "train-policy": "--preset --SECTION.KEY --device --task --seed --run-dir --model-dir --from-scratch --force "
+    "--environment --video-model --reward --judge --judge-model --judge-key-env --rubric --compose "
+    "--domain-id --verbose",
+    "train-video-model": "--preset --SECTION.KEY --seed --run-dir --from-scratch --bags --heldout-bags --keep-buffers "
+    "--reward --judge --judge-model --judge-key-env --rubric --tensorboard --no-tensorboard --domain-id --verbose",
+    "check-video-model": "--video-model --context-bags --public --prompt --picture --size --lora-rank --preset "
+    "--SECTION.KEY",
+    "seed-study": "--tasks --seeds --arms --preset --SECTION.KEY --device --model-dir --threads --out",
+    "collect": "folder --tasks --episodes --first-seed --preset --SECTION.KEY --device",
     "rescore": "recording --reward --judge --judge-model --judge-key-env --rubric --json --config --model-dir "
     "--namespace --reads --audit",
-    "retrain": "run --run-dir --set --tensorboard",
+    "retrain": "run --run-dir --SECTION.KEY --tensorboard",
     "recover-bag": "bag --output",
     "judge-clips": "clips --config --device --judge --judge-model --judge-key-env --rubric --mode --audit --reads "
     "--json",
-    "judge check": "judge --model --key-env --rubric --limit --reads --set --device --json",
+    "judge check": "judge --model --key-env --rubric --limit --reads --SECTION.KEY --device --json",
     "judge serve-help": "--memory",
     "judge calibrate": "model_dir bags --stride --moving --seed --device",
     "judge hack": "clips --config --device --judge --judge-model --judge-key-env --rubric --least --limit "
@@ -75,13 +76,16 @@ def test_every_verb_explains_itself_and_names_its_options(verb: str, capsys: pyt
         (["benchmark", "hackin"], "unknown verb 'benchmark hackin'; did you mean 'benchmark hacking'?"),
         (["recover-bag", "nothing-here"], "no .mcap file at nothing-here"),
         (["rescore", "nothing-here"], "nothing-here holds no config.yaml; name the run folder"),
-        (["train-policy", "--set", "ppo.updates=many"], "ppo.updates"),
+        (["train-policy", "--ppo.updates", "many"], "ppo.updates"),
         (["train-policy", "--preset", "nosuch"], "nosuch"),
         (["train-policy", "--preset", "gpu", "--device", "cpu"], "table_top_cube was trained with 64; width 256"),
         (["train-policy", "--environment", "video_model"], "--video-model DIR go together; give both, or none"),
         (["train-policy", "--video-model", "nothing-here"], "--video-model DIR go together; give both, or none"),
         (["train-policy", "--environment", "video_model", "--video-model", "nowhere"], "nowhere holds no manifest"),
-        (["train-video-model", "--set", "width"], "section.key=value"),
+        (["train-video-model", "--iterations", "many"], "iterations: Input should be a valid integer"),
+        (["train-video-model", "--model.width"], "expected a value behind --model.width"),
+        (["train-policy", "--ppo.update", "3"], "unknown setting 'ppo.update'; did you mean 'ppo.updates'?"),
+        (["train-policy", "--pppo.updates", "3"], "unknown setting 'pppo'; did you mean 'ppo'?"),
     ],
 )
 def test_an_error_is_one_line_and_code_2(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -91,11 +95,20 @@ def test_an_error_is_one_line_and_code_2(words: list[str], said: str, capsys: py
 
 
 def test_a_wrong_option_is_one_line_and_code_2(capsys: pytest.CaptureFixture[str]) -> None:
-    for words in (["recover-bag"], ["audit", "verify"], ["audit", "sing"], ["retrain", "run", "--seed", "1"]):
+    for words in (["recover-bag"], ["audit", "verify"], ["audit", "sing"], ["retrain", "run", "--seed", "1"],
+                  ["audit", "verify", "log", "--ppo.updates", "3"], ["judge-clips", "clips", "--ppo.updates", "3"]):
         with pytest.raises(SystemExit, match="2"):
             cli.main(words)
         text = capsys.readouterr().err
         assert text.startswith("error: ") and text.count("\n") == 1 and f"see wm {words[0]}" in text
+
+
+def test_a_misspelt_option_is_answered_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, near in ((["train-policy", "--rund-dir", "x"], "--run-dir"),
+                        (["train-video-model", "--iteration", "3"], "--iterations")):
+        with pytest.raises(SystemExit, match="2"):
+            cli.main(words)
+        assert f"did you mean {near}?; see wm {words[0]} --help" in capsys.readouterr().err
 
 
 def verb_that(does: Callable[[argparse.Namespace], int | None], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,10 +18,10 @@ SHARES = {"expert": 0.5, "detour": 0.25, "near_miss": 0.25}
 
 
 def arguments(folder: Path, episodes: int = 3) -> list[str]:
-    shares = [f"--set=data.behaviours={{{', '.join(f'{name}: {share}' for name, share in SHARES.items())}}}"]
+    shares = [f"--data.behaviours={{{', '.join(f'{name}: {share}' for name, share in SHARES.items())}}}"]
     return [
         "collect", str(folder), "--tasks", "push", "--episodes", str(episodes), *shares,
-        "--set=simulation.image_size=16", "--set=data.num_workers=1", "--set=simulation.max_episode_steps=20",
+        "--simulation.image_size=16", "--data.num_workers=1", "--simulation.max_episode_steps=20",
     ]
 
 

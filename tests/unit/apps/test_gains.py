@@ -1,10 +1,9 @@
 """The headline number of the paper's Table 1 from its cells, and of the study's rows."""
 
-from pathlib import Path
 
 import pytest
 
-from wm_nodes.apps.seed_study import gain_over_simulator, mean_gain, read_results
+from wm_nodes.apps.seed_study import gain_over_simulator, mean_gain
 
 TASKS = ("pick and place", "push", "pull", "move to aim")
 IND = {
@@ -54,8 +53,3 @@ def test_the_study_compares_the_arms_on_the_seeds_that_both_have() -> None:
             row("push_cube", "world_model", 0, 160), row("push_cube", "simulator", 0, 180)]
     assert gain_over_simulator(rows) == pytest.approx(-7.5)
     assert gain_over_simulator(rows[:1]) is None
-
-
-def test_results_from_before_acceptance_had_its_name_read_like_those_of_today(tmp_path: Path) -> None:
-    (tmp_path / "results.jsonl").write_text('{"task": "reach", "gate_passed": true, "gate": {"passed": true}}\n')
-    assert read_results(tmp_path) == [{"task": "reach", "accepted": True, "acceptance": {"passed": True}}]

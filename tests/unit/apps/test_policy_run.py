@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wm_nodes.apps.model_refresh_loop import round_config, split_updates
 from wm_nodes.apps.policy_run import cached_success
 from wm_nodes.config.load import load_config
+from wm_nodes.policy_rl.model_refresh import round_config, split_updates
 from wm_nodes.reports.summary import SuccessRate, Summary
 from wm_nodes.reports.tables import ROUND_COLUMNS, round_rows
 from wm_nodes.training.metrics import MetricsWriter, join_metrics, read_metrics

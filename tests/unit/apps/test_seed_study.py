@@ -18,9 +18,9 @@ def test_a_study_in_rounds_refreshes_the_model_and_keeps_finished_rows(
     monkeypatch.setattr(seed_study, "IMAGINED_EPISODES", 8)
     model, out = make_model_folder(tmp_path / "model"), tmp_path / "study"
     words = ["seed-study", "--preset", "smoke", "--tasks", "push_cube", "--seeds", "0", "--arms", "world_model",
-             "--threads", "1", "--model-dir", str(model), "--out", str(out), "--set", "model_refresh.num_rounds=2",
-             "--set", "exploit_meter.every=1", "--set", "exploit_meter.episodes=2", "--set", "evaluation.episodes=2",
-             "--set", "simulation.max_episode_steps=12"]
+             "--threads", "1", "--model-dir", str(model), "--out", str(out), "--model_refresh.num_rounds", "2",
+             "--exploit_meter.every", "1", "--exploit_meter.episodes", "2", "--evaluation.episodes", "2",
+             "--simulation.max_episode_steps", "12"]
     assert main(words) == 0
     (row,) = read_results(out)
     (refresh,) = row["refreshes"]

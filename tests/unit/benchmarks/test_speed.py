@@ -68,15 +68,16 @@ def test_a_simulator_that_was_not_measured_is_shown_with_the_reason_and_no_numbe
 
 @pytest.mark.parametrize(
     ("value", "words"),
-    [("world_model.width=7", "world_model.width 7"), ("world_model.widht=96", "widht"), ("width", "section.key=value")],
+    [("world_model.width=7", "world_model.width 7"), ("world_model.widht=96", "widht"),
+     ("world_model.width", "expected a value behind")],
 )
 def test_an_untrained_model_of_an_impossible_size_is_refused_before_anything_is_measured(
     value: str, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["benchmark", "speed", "--preset", "smoke", "--untrained", "--set", value]) == 2
+    assert main(["benchmark", "speed", "--preset", "smoke", "--untrained", f"--{value}"]) == 2
     assert words in capsys.readouterr().err
 
 
 def test_settings_without_an_untrained_model_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["benchmark", "speed", "--set", "world_model.width=96"]) == 2
+    assert main(["benchmark", "speed", "--world_model.width", "96"]) == 2
     assert "are of a model with random weights" in capsys.readouterr().err

@@ -186,6 +186,7 @@ CALLS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("experiment", CALLS)
 def test_every_file_says_how_it_was_made(
     experiment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

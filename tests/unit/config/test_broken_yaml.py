@@ -93,13 +93,13 @@ def test_commands_and_launch_files_end_with_one_line(
     )
     (tmp_path / "manifest.json").write_text("{}")
     model = [f"model_dir:={tmp_path}", f"run_dir:={run}"]
-    judge = ["--reward", "agent", "--judge", "http://a/v1", "--judge-model", "judge", "--set", "ppo.num_steps=16"]
+    judge = ["--reward", "agent", "--judge", "http://a/v1", "--judge-model", "judge", "--ppo.num_steps", "16"]
     commands: list[Callable[[], int]] = [
         lambda: main(["train-policy", "--preset", str(path), "--run-dir", str(run)]),
         lambda: main(["train-video-model", "--preset", str(path), "--run-dir", str(run)]),
         lambda: main(["train-policy", "--preset", "smoke", *judge, "--rubric", str(path), "--run-dir", str(run)]),
         lambda: launch("evaluate", [f"preset:={path}", *model]),
-        lambda: launch("evaluate", [f"config_file:={path}", *model]),
+        lambda: launch("world_model_rl", [f"preset:={path}", *model, "video_model_dir:=m", "context_bags:=b"]),
         lambda: launch("evaluate", [f"params_file:={path}", *model]),
         lambda: launch("world_model_rl", [f"params_file:={path}", *model, "video_model_dir:=m", "context_bags:=b"]),
     ]
@@ -142,7 +142,7 @@ def test_a_bag_names_its_broken_metadata(kind: str, tmp_path: Path) -> None:
 
 
 def test_a_value_of_the_command_line_is_one_line_too(capsys: pytest.CaptureFixture[str]) -> None:
-    for text in ("ppo.updates=[1", "ppo.updates=2001-13-45", "ppo.updates={a: b: c}"):
-        assert main(["train-policy", "--set", text]) == 2
+    for text in ("[1", "2001-13-45", "{a: b: c}"):
+        assert main(["train-policy", "--ppo.updates", text]) == 2
         said = capsys.readouterr().err
-        assert f"value of {text!r} is no YAML: " in said and said.count("\n") == 1
+        assert f"{text!r} of ppo.updates is no YAML: " in said and said.count("\n") == 1

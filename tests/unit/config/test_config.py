@@ -8,8 +8,8 @@ from wm_nodes.config.load import (
     dump_config,
     load_config,
     load_video_config,
-    parse_override,
     preset_names,
+    split_settings,
 )
 from wm_nodes.config.shipped import PRETRAINED, shipped_model
 
@@ -41,26 +41,6 @@ def test_a_saved_configuration_comes_back_equal(tmp_path: Path) -> None:
     assert load_config(str(path)) == config
 
 
-def test_a_configuration_saved_before_sections_were_renamed_comes_back_equal(tmp_path: Path) -> None:
-    config = load_config("smoke", {"acceptance.num_episodes": 5, "model_refresh.num_rounds": 2})
-    text = dump_config(config).replace("\nacceptance:", "\ngate:").replace("\nmodel_refresh:", "\nrounds:")
-    assert "gate:\n" in text and "rounds:\n" in text
-    (tmp_path / "config.yaml").write_text(text)
-    assert load_config(str(tmp_path / "config.yaml")) == config
-
-
-def test_a_configuration_saved_with_a_setting_that_is_gone_comes_back_without_it(tmp_path: Path) -> None:
-    text = dump_config(load_config("smoke")).replace("own_starts: 128", "tolerance: 0.05")
-    assert "tolerance" in text
-    (tmp_path / "config.yaml").write_text(text)
-    assert load_config(str(tmp_path / "config.yaml")) == load_config("smoke")
-
-
-def test_a_renamed_section_is_refused_on_the_command_line_with_its_name_of_today() -> None:
-    with pytest.raises(ConfigError, match="unknown setting 'gate', now called 'acceptance'"):
-        load_config("smoke", {"gate.num_episodes": 5})
-
-
 def test_both_loops_have_the_judge_of_one_file() -> None:
     assert load_config("base").judge == load_video_config("base").judge == default_judge()
 
@@ -79,7 +59,8 @@ def test_a_changed_copy_is_checked_like_a_preset() -> None:
     [
         ("best", {}, r"unknown preset 'best'.*smoke"),
         ("cpu", {"ppo.clip": -1}, r"ppo\.clip.*greater than 0.*-1"),
-        ("cpu", {"ppo.speed": 1}, r"unknown setting 'ppo\.speed'"),
+        ("cpu", {"ppo.speed": 1}, r"unknown setting 'ppo\.speed'; known there: updates, num_envs"),
+        ("cpu", {"ppo.updats": 1}, r"unknown setting 'ppo\.updats'; did you mean 'ppo\.updates'\?"),
         ("cpu", {"task": "fly"}, r"task.*push_cube.*'fly'"),
     ],
 )
@@ -88,10 +69,14 @@ def test_a_wrong_preset_or_setting_is_one_clear_error(preset: str, overrides: di
         load_config(preset, overrides)
 
 
-def test_an_override_without_a_value_says_what_it_expects() -> None:
-    assert parse_override("ppo.updates=3") == ("ppo.updates", 3)
-    with pytest.raises(ConfigError, match=r"section\.key=value"):
-        parse_override("ppo.updates")
+def test_settings_are_taken_out_of_a_command_line_and_a_missing_value_is_named() -> None:
+    words = ["bag.x", "--ppo.updates", "3", "--seed", "1", "--rewards.scenery=-10", "--reward.sparse_weight", "-1e-3"]
+    rest, settings = split_settings(words)
+    assert rest == ["bag.x", "--seed", "1"]
+    assert settings == {"ppo.updates": 3, "rewards.scenery": -10, "reward.sparse_weight": "-1e-3"}
+    assert split_settings(["--rewards", "{agent: 1}"], ["rewards"]) == ([], {"rewards": {"agent": 1}})
+    with pytest.raises(ConfigError, match=r"expected a value behind --ppo\.updates"):
+        split_settings(["--ppo.updates"])
 
 
 def test_one_entry_of_a_free_mapping_can_be_set_and_the_mapping_replaced() -> None:

@@ -38,8 +38,7 @@ TASKS = ("pull_cube", "push_cube", "reach")
 IN_SCENES = ("move_to_aim", "pick_place", "pull", "push", "reach_object")
 ALL = "all_tasks"
 """Those of the procedural scenes, and the one whose episodes are of all of them."""
-NAMED_IN = {"environments/maniskill/objects.py", "judge/clip_files.py", "apps/judge_clips.py",
-            "policy_rl/train.py"}
+NAMED_IN = {"environments/maniskill/objects.py", "judge/clip_files.py", "apps/judge_clips.py", "policy_rl/train.py"}
 """Those that share a model, two lines of clips.jsonl, an example."""
 
 

@@ -35,6 +35,7 @@ def page_faults(how: str) -> int:
     return int(done.stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library keeps its own rules")
 def test_equal_steps_touch_no_new_pages() -> None:
     assert page_faults("keep") < 100

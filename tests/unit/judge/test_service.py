@@ -6,7 +6,7 @@ import time
 from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import replace
-from itertools import groupby
+from itertools import count, groupby
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +33,7 @@ from wm_nodes.judge.backends.factory import check_judge
 from wm_nodes.judge.episode_reward import EpisodeReward, PendingReward, check_horizon, unjudged_reason
 from wm_nodes.judge.service import ClipJob, JudgeService
 from wm_nodes.launching import arguments as launch_arguments
-from wm_nodes.launching.graph import GraphError
+from wm_nodes.launching.graph import Graph, GraphError
 from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.rollouts import tensors_of, terminate_at_episode_end
 
@@ -314,7 +314,7 @@ def test_the_command_refuses_an_embedded_judge_that_cannot_read_its_clips_before
     [
         (["--reward", "agent", "--judge-model", "judge"], "needs a judge"),
         (["--judge-model", "judge"], "judge.model would change nothing without --reward agent"),
-        (["--reward", "agent", *JUDGE, "--set", "ppo.num_steps=15"], "ppo.num_steps is 15"),
+        (["--reward", "agent", *JUDGE, "--ppo.num_steps", "15"], "ppo.num_steps is 15"),
         (["--reward", "agent", *JUDGE, "--rubric", "nowhere"], "nowhere"),
         (["--reward", "agent", "--judge", "LONG"], "cannot judge clips of 17 frames, 64 x 128 px"),
         (["--reward", "agent", "--judge", "LONG"], "Name a server"),
@@ -328,7 +328,7 @@ def test_the_main_job_refuses_an_agent_that_could_not_judge_before_anything_is_m
     run_dir = tmp_path / "run"
     if "LONG" in options:
         options = [*options[:-1], str(changed_judge(tmp_path / "long", lengths=(40, 50)))]
-    given = ["--preset", "smoke", "--set", "ppo.num_steps=16", "--run-dir", str(run_dir), *options]
+    given = ["--preset", "smoke", "--ppo.num_steps", "16", "--run-dir", str(run_dir), *options]
     assert main(["train-policy", *given]) == 2
     assert words in capsys.readouterr().err and not run_dir.exists()
 
@@ -337,38 +337,43 @@ def test_launch_arguments_bring_the_agent_into_both_loops(tmp_path: Path) -> Non
     (tmp_path / "manifest.json").write_text("{}")
     preset = tmp_path / "whole_episodes.yaml"
     preset.write_text("ppo: {num_steps: 16}")
-    given = {"run_dir": str(tmp_path / "run"), "model_dir": str(tmp_path), "domain_id": "7"}
+    given = {"model_dir": str(tmp_path), "domain_id": "7"}
     judge = {"reward": "agent", "judge": "http://localhost:1/v1", "judge_model": "judge"}
     policies = {**given, "preset": str(preset)}
-    graph, values = launch_arguments.prepare("online_training", {**policies, **judge})
+    numbers = count()
+
+    def prepared(scenario: str, arguments: dict[str, str]) -> tuple[Graph, dict[str, str]]:
+        return launch_arguments.prepare(scenario, {**arguments, "run_dir": str(tmp_path / f"run_{next(numbers)}")})
+
+    graph, values = prepared("online_training", {**policies, **judge})
     assert graph.node("reward_evaluator").parameters["reward"] == "agent"
     assert graph.node("learner").parameters["join_timeout_s"] == 600
     topics = graph.node("recorder").parameters["topics"]
     assert isinstance(topics, list) and "reward/verdict" in topics
-    assert load_config(values["config_file"]).judge.endpoints == ["http://localhost:1/v1"]
-    clips = {**given, "video_preset": "smoke", "video_model_dir": "m", "context_bags": "b"}
+    assert load_config(f"{values['run_dir']}/config.yaml").judge.endpoints == ["http://localhost:1/v1"]
+    clips = {**given, "preset": "smoke", "video_model_dir": "m", "context_bags": "b"}
     shipped, long = str(shipped_model("push_cube")), str(changed_judge(tmp_path / "long", lengths=(40, 50)))
     for name, folder in (("embedded", ""), (shipped, shipped)):
-        _, values = launch_arguments.prepare("world_model_rl", {**clips, "reward": "agent", "judge": name})
-        here = load_video_config(values["config_file"]).judge
+        _, values = prepared("world_model_rl", {**clips, "reward": "agent", "judge": name})
+        here = load_video_config(f"{values['run_dir']}/config.yaml").judge
         assert (here.kind, here.folder, here.endpoints) == ("embedded", folder, [])
-    _, values = launch_arguments.prepare("world_model_rl", {**clips, **judge})
-    config = load_video_config(values["config_file"])
+    _, values = prepared("world_model_rl", {**clips, **judge})
+    config = load_video_config(f"{values['run_dir']}/config.yaml")
     assert config.rewards == {"agent": 1.0} and config.judge.model == "judge"
     for scenario, arguments, load in (
         ("online_training", policies, load_config), ("world_model_rl", clips, load_video_config),
     ):
-        _, values = launch_arguments.prepare(scenario, {**arguments, "reward": "agent"})
-        assert load(values["config_file"]).judge.kind == "embedded", "nobody is named: the one that needs nothing"
+        _, values = prepared(scenario, {**arguments, "reward": "agent"})
+        judge_of_run = load(f"{values['run_dir']}/config.yaml").judge
+        assert judge_of_run.kind == "embedded", "nobody is named: the one that needs nothing"
     refusals = [
         ("online_training", {**policies, "reward": "agent", "judge_model": "judge"}, "needs a judge"),
         ("online_training", {**policies, "reward": "agent", "judge": long}, "cannot judge clips of .* 64 x 128"),
         ("online_training", {**policies, "judge": "http://localhost:1/v1"}, "would change nothing without"),
-        ("online_training", {**given, **judge, "config_file": values["config_file"]}, "belong into it"),
         ("online_training", {**policies, **judge, "preset": "smoke"}, r"ppo\.num_steps is 6"),
         ("world_model_rl", {**clips, "reward": "rule"}, "is of policies"),
         ("world_model_rl", {**clips, "reward": "agent", "judge_model": "judge"}, "needs a judge"),
     ]
     for scenario, arguments, words in refusals:
         with pytest.raises(GraphError, match=words):
-            launch_arguments.prepare(scenario, arguments)
+            prepared(scenario, arguments)

@@ -20,15 +20,14 @@ from wm_nodes.launching.domain_lock import DomainInUseError, DomainLock
 from wm_nodes.launching.environment import graph_environment
 from wm_nodes.launching.graph import Graph, GraphError, NodeSpec
 from wm_nodes.launching.runner import Runner, main
-from wm_nodes.launching.saved_arguments import read_arguments
 from wm_nodes.launching.scenarios import (
     ARGUMENTS,
     SCENARIOS,
-    build_graph,
     describe_arguments,
     parse_arguments,
 )
 from wm_nodes.ros.middleware import PROFILE
+from wm_nodes.training.run_record import read_record
 from wm_nodes.world_model import load_starts
 
 FILES: list[tuple[str, dict[str, str]]] = [
@@ -45,7 +44,7 @@ def given(tmp_path: Path) -> dict[str, str]:
     (tmp_path / "bag").mkdir()
     return {
         "run_dir": str(tmp_path / "run"), "model_dir": str(tmp_path / "model"), "bag_uri": str(tmp_path / "bag"),
-        "preset": "smoke", "domain_id": "7", "video_preset": "smoke", "video_model_dir": str(tmp_path / "model"),
+        "preset": "smoke", "domain_id": "7", "video_model_dir": str(tmp_path / "model"),
         "context_bags": f"{tmp_path / 'bag'},{tmp_path / 'bag'}",
     }
 
@@ -55,7 +54,8 @@ def of(scenario: str, given: dict[str, str]) -> dict[str, str]:
 
 
 def labels(scenario: str, given: dict[str, str], **more: str) -> list[str]:
-    graph, _ = launch_arguments.prepare(scenario, {**of(scenario, given), **more})
+    own = {"run_dir": f"{given['run_dir']}/{scenario}"}
+    graph, _ = launch_arguments.prepare(scenario, {**of(scenario, given), **own, **more})
     return [node.label for node in graph.nodes]
 
 
@@ -133,9 +133,9 @@ def test_held_out_bags_and_their_judge_go_to_the_learner_of_loop_2_and_none_wher
 
 def test_configuration_of_the_run_is_written_and_sets_the_number_of_environments(given: dict[str, str]) -> None:
     graph, values = launch_arguments.prepare("online_training", of("online_training", given) | {"task": "reach"})
-    assert "task: reach" in Path(values["config_file"]).read_text()
-    assert graph.node("wm/environment").parameters["num_envs"] == 8
-    assert (Path(values["run_dir"]) / "graph.json").is_file()
+    parameters = graph.node("wm/environment").parameters
+    assert parameters["config_file"] == f"{values['run_dir']}/config.yaml" and parameters["num_envs"] == 8
+    assert "task: reach" in Path(values["run_dir"], "config.yaml").read_text()
 
 
 def test_composed_process_carries_the_nodes_of_the_namespace_with_their_own_parameters(given: dict[str, str]) -> None:
@@ -167,12 +167,6 @@ def test_learner_of_several_ranks_is_not_composed(given: dict[str, str]) -> None
     more = {"compose": "true", "learner_ranks": "2"}
     graph, _ = launch_arguments.prepare("online_training", of("online_training", given) | more)
     assert graph.node("learner").name == "learner"
-
-
-def test_graph_of_the_run_is_kept_as_json(given: dict[str, str]) -> None:
-    graph, values = launch_arguments.prepare("online_training", of("online_training", given) | {"compose": "true"})
-    kept = json.loads((Path(values["run_dir"]) / "graph.json").read_text())
-    assert [node["name"] for node in kept["nodes"]] == [node.name for node in graph.nodes]
 
 
 @pytest.mark.parametrize(
@@ -210,7 +204,7 @@ def test_several_ranks_start_under_torchrun() -> None:
 
 def test_the_shipped_model_brings_the_first_frames_that_a_launch_file_imagines_from(tmp_path: Path) -> None:
     for task in ("push_cube", "reach"):
-        values = launch_arguments.resolve("online_training", {"task": task, "run_dir": str(tmp_path / task)})
+        _, values = launch_arguments.prepare("online_training", {"task": task, "run_dir": str(tmp_path / task)})
         images, states = load_starts(Path(values["starts_file"]))
         assert len(images) >= 32 and images.shape[1:] == (64, 128, 3) and states.shape == (len(images), 3)
 
@@ -268,11 +262,13 @@ class StubLaunch:
         }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scenario", "compose"), FILES)
 def test_both_faces_of_a_launch_file_start_the_same_processes(
     scenario: str, compose: dict[str, str], given: dict[str, str], repository: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    values = of(scenario, given) | compose
+    setting = {} if "judge" in SCENARIOS[scenario].arguments else {"judge.max_reads": "3"}
+    values = of(scenario, given) | compose | setting
     stub = StubLaunch(values)
     for name, module in stub.modules().items():
         monkeypatch.setitem(sys.modules, name, module)
@@ -289,8 +285,9 @@ def test_both_faces_of_a_launch_file_start_the_same_processes(
     with holder(Path(values["run_dir"])), pytest.raises(RunFolderInUseError, match=r"is in use by process \d+ on"):
         start.named["function"](Context({**defaults, **values}))
     nodes = start.named["function"](Context({**defaults, **values}))
-    kept = set(values) - {"run_dir", "domain_id", "compose", "respawn"}
-    assert set(read_arguments(Path(values["run_dir"]))[scenario]) == kept
+    record = read_record(Path(values["run_dir"]))
+    assert record is not None and not {"run_dir", "domain_id", "respawn"} & set(record.options[scenario])
+    assert not setting or record.settings["judge"]["max_reads"] == 3
     (lock,) = launch_face.LOCKS
     with pytest.raises(DomainInUseError, match=r"ROS domain 7 is already in use .*domain_id:=8"):
         start.named["function"](Context({**defaults, **values}))
@@ -309,7 +306,7 @@ def test_both_faces_of_a_launch_file_start_the_same_processes(
         else:
             assert action.named["name"] == node.name
             assert action.named["parameters"] == ([dict(node.parameters)] if node.parameters else [])
-        assert ("on_exit" in action.named) == (not node.respawn) and node.required
+        assert ("on_exit" in action.named) == (not node.respawn)
         assert action.named.get("respawn", False) == node.respawn == (values.get("respawn") == "true")
         assert action.named["additional_env"]["ROS_DOMAIN_ID"] == str(runner.domain) == "7"
 
@@ -340,6 +337,5 @@ def test_second_graph_on_a_domain_is_refused_with_the_first_ones_name(tmp_path: 
 
 
 def test_build_graph_passes_the_range_and_domain_on(given: dict[str, str]) -> None:
-    values = launch_arguments.resolve("evaluate", of("evaluate", given) | {"discovery_range": "SUBNET"})
-    environment = build_graph("evaluate", values).environment
-    assert environment == {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "ROS_DOMAIN_ID": "7"}
+    graph, _ = launch_arguments.prepare("evaluate", of("evaluate", given) | {"discovery_range": "SUBNET"})
+    assert graph.environment == {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "ROS_DOMAIN_ID": "7"}

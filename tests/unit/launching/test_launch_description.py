@@ -93,26 +93,22 @@ def test_every_node_of_every_way_to_start_has_the_limit_of_its_memory(given: dic
 def test_plug_ins_and_a_parameter_file_reach_the_nodes(given: dict[str, str], tmp_path: Path) -> None:
     file = tmp_path / "more.yaml"
     file.write_text("/**:\n  ros__parameters:\n    peer_timeout_s: 9.0\n")
-    more = {"backend": "environment", "params_file": str(file),
-            "set": "environment.factory=robot:make; policy.factory=mine:policy;reward.factory=mine:reward"}
+    more = {"backend": "environment", "params_file": str(file), "environment.factory": "robot:make",
+            "policy.factory": "mine:policy", "reward.factory": "mine:reward"}
     graph, values = launch_arguments.prepare("rollout_record", {**given, **more})
     assert graph.node("environment").parameters["backend"] == "environment"
-    config = load_config(values["config_file"])
+    config = load_config(f"{values['run_dir']}/config.yaml")
     factories = config.environment.factory, config.policy.factory, config.reward.factory
     assert factories == ("robot:make", "mine:policy", "mine:reward")
     assert all(node.ros_arguments()[-2:] == ["--params-file", str(file)] for node in graph.nodes)
     graph, _ = launch_arguments.prepare("evaluate", {**given, "initial_policy": "/weights.safetensors"})
     assert graph.node("evaluation").parameters["initial_policy"] == "/weights.safetensors"
-    with pytest.raises(GraphError, match=r"config_file is given, so learner\.factory belong into it"):
-        launch_arguments.prepare(
-            "online_training", {**given, "config_file": values["config_file"], "set": "learner.factory=mine:learner"}
-        )
 
 
 def test_without_a_task_the_model_is_named_and_nothing_is_measured_where_evaluation_is_none(
     given: dict[str, str]
 ) -> None:
-    more = {"task": "", "model_dir": "", "set": "evaluation.environment=none"}
+    more = {"task": "", "model_dir": "", "evaluation.environment": "none", "run_dir": f"{given['run_dir']}_own"}
     with pytest.raises(GraphError, match="no world model is shipped for task ''"):
         launch_arguments.prepare("online_training", {**given, **more})
     graph, _ = launch_arguments.prepare("online_training", {**given, **more, "model_dir": given["model_dir"]})

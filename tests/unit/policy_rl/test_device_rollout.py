@@ -85,6 +85,7 @@ def test_too_much_disagreement_truncates_and_pays_nothing() -> None:
     assert_same(lockstep, found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mode", "positions"), [("delta", False), ("abs", False), ("delta", True)])
 def test_the_dense_reward_is_that_of_the_reward_model_and_a_missing_goal_is_missing(mode: str, positions: bool) -> None:
     config = config_of(reward__dense_weight=0.5, reward__mode=mode, reward__goal_threshold=0.99995,
@@ -103,6 +104,7 @@ def test_token_models_take_the_same_path(tmp_path: Path) -> None:
     assert_same(lockstep, found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("advantage", ["gae", "group"])
 def test_training_from_device_rollouts_gives_the_weights_of_the_lock_step_loop(advantage: str) -> None:
     config = config_of(ppo__num_envs=32, ppo__num_steps=STEPS, ppo__updates=2, ppo__value_warmup_updates=0,

@@ -122,5 +122,5 @@ def test_the_next_round_also_imagines_from_frames_of_the_policys_own_episodes(
 def test_quantised_models_are_refused_with_the_remedy(config: RunConfig, tmp_path: Path) -> None:
     quantised = config.model_copy(update={"tokenizer": config.tokenizer.model_copy(update={"kind": "lfq"})})
     folder = make_model_folder(tmp_path / "model", quantised)
-    with pytest.raises(ValueError, match=r"tokenizer\.kind lfq.*--rounds 1"):
+    with pytest.raises(ValueError, match=r"tokenizer\.kind lfq.*num_rounds to 1"):
         refresh_model(quantised, folder, [], tmp_path / "new")

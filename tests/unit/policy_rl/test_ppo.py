@@ -45,6 +45,7 @@ def grouped(**changes: Any) -> PpoConfig:
     return toy_ppo(advantage="group", group_size=3, num_steps=12, **changes)
 
 
+@pytest.mark.slow
 def test_groups_learn_to_reach_without_a_critic() -> None:
     policy, env = toy_policy(), ReachToy(108, 0)
     settings = grouped(learning_rate=3e-3, kl_reference_weight=0.0, value_warmup_updates=9, minibatch_size=64)
@@ -145,6 +146,7 @@ def test_the_standard_deviation_keeps_its_floor() -> None:
     assert (policy.log_std_A >= floor).all()
 
 
+@pytest.mark.slow
 def test_a_policy_beyond_the_limits_learns_on_with_finite_weights() -> None:
     """The mean of one action lies 0.2 beyond the limit, as a gripper's does after demonstrations."""
     policy = toy_policy()

@@ -158,6 +158,7 @@ def test_a_file_that_is_not_in_the_order_of_time_is_read_in_it_where_sequence_nu
         assert_same_episodes(tmp_path / name, own)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("plugin", "mode"), FORMATS)
 def test_a_bag_with_a_damaged_byte_is_a_bag_error_or_gives_a_part_of_its_messages(
     tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode

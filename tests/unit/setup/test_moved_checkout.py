@@ -80,3 +80,22 @@ def test_an_environment_elsewhere_follows_the_checkout_that_used_it_last(tmp_pat
     assert SAID in said and "setting up" not in said
     checkout.root = tmp_path / "checkout"
     assert SAID in checkout.complete()
+
+
+def test_messages_that_came_along_in_a_copy_are_not_compiled_again_for_an_environment_of_its_own(
+    tmp_path: Path, repository: Path
+) -> None:
+    checkout = SmallCheckout(tmp_path, repository)
+    checkout.complete()
+    old, old_venv = checkout.root, checkout.venv
+    checkout.root = shutil.copytree(old, tmp_path / "Bücher und" / "copy", symlinks=True)
+    checkout.venv, checkout.log = tmp_path / "second", tmp_path / "second_setup.log"
+    checkout.environment["WM_VENV"] = str(checkout.venv)
+    said = checkout.complete()
+    assert "building tf2_msgs" in said and "wm_msgs, the message types" not in said
+    commands = [line for line in checkout.log.read_text("utf-8").splitlines() if "-m colcon" in line]
+    assert len(commands) == 1 and "/tf2_msgs " in commands[0]
+    assert holding(checkout.root, old) == holding(checkout.root, old_venv) == []
+    assert checkout.complete() == ""
+    (checkout.root / "msgs_schema/package.xml").open("a").write("<!-- changed -->")
+    assert "building wm_msgs" in checkout.complete()

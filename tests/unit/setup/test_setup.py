@@ -111,7 +111,7 @@ def tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(entry, "WORKSPACE", root / "ros2_ws")
     venv = root / ".venv"
     stamp.write_stamp(venv / "wm_setup_stamp.json", entry._wanted(venv))
-    (root / "ros2_ws/install/wm_msgs" / entry.SOURCES).write_text(entry._wanted(venv)["messages"])
+    stamp.write_stamp(root / "ros2_ws/install/wm_msgs" / entry.SOURCES, entry._wanted(venv))
     assert entry.pending(venv) == []
     return root
 

@@ -599,7 +599,7 @@ class TestFolder:
     def test_the_doctor_passes_it_with_and_without_an_adapter_and_refuses_a_folder_that_is_none(
         self, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        small = ["--size", "32x32", "--frames", "5", "--set", "rollout.num_steps=3", "--set", "grpo.kl.anchor=buffer"]
+        small = ["--size", "32x32", "--frames", "5", "--rollout.num_steps", "3", "--grpo.kl.anchor", "buffer"]
         for more in ([], ["--lora-rank", "2"]):
             assert main(["check-video-model", "--public", str(folder), *small, *more]) == 0, capsys.readouterr().out
         assert main(["check-video-model", "--public", str(tmp_path), *small]) == 2
@@ -609,7 +609,7 @@ class TestFolder:
         scope = run_documented(folder, tmp_path, "cpu", "bfloat16")
         assert scope["report"].kept == 4 and scope["learner"].version == 4
         trained = dict(scope["public"].velocity.named_parameters())
-        other = load_public_model(folder, LoadSettings(dtype="bfloat16", text=False)).velocity
+        other = load_public_model(folder, LoadSettings(dtype="bfloat16", max_tokens=12)).velocity
         load_lora(other, tmp_path)
         adapter = {name: p for name, p in other.named_parameters() if "lora_B" in name}
         assert adapter and all(torch.equal(p, trained[name]) for name, p in adapter.items())

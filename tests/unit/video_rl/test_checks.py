@@ -109,7 +109,7 @@ def size(model: VideoNetwork, parameters: Any) -> float:
 def test_settings_that_cannot_train_are_one_clear_error(
     setting: str, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["check-video-model", "--set", setting]) == 2
+    assert main(["check-video-model", f"--{setting}"]) == 2
     assert words in capsys.readouterr().err
 
 

@@ -11,7 +11,7 @@ from metric_docs import documented, written
 from video_toys import tiny_network, toy_buffer, toy_rollout_settings, weights
 
 from wm_nodes.config.load import load_video_config
-from wm_nodes.config.video import RolloutConfig, VideoRlConfig
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.training.metrics import read_metrics
 from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model import VideoNetwork
@@ -26,7 +26,7 @@ SCORES = set(WATCHED)
 def config(*, every: int = 1, **grpo: Any) -> VideoRlConfig:
     plain = load_video_config("smoke")
     return plain.with_values(
-        rollout=RolloutConfig.model_validate(ROLLOUT, from_attributes=True),
+        rollout=ROLLOUT,
         evaluation=plain.evaluation.with_values(every=every, window=3),
         grpo=plain.grpo.with_values(learning_rate=1e-3, **grpo),
     )
@@ -190,3 +190,24 @@ def test_a_skipped_buffer_is_counted_in_the_log_and_a_resumed_run_samples_by_the
     assert "kl_1" not in read_metrics(stopped, "grpo")[1] and read_metrics(stopped, "grpo")[1]["kept"] == 0
     assert progress(straight) == progress(stopped) == (4, 3)
     assert (straight / VIDEO_FILES.uri(4)).read_bytes() == (stopped / VIDEO_FILES.uri(4)).read_bytes()
+
+
+def test_what_the_check_of_a_run_raises_ends_a_training_with_nothing_changed(tmp_path: Path) -> None:
+    run = VideoRun(tiny_network(), config(), tmp_path)
+    before, calls = weights(run.network), list[int]()
+
+    def check() -> None:
+        calls.append(1)
+        if len(calls) == 2:  # the first optimizer step is made
+            raise InterruptedError("stopped by the user")
+
+    buffer = toy_buffer(run.network, ROLLOUT).with_rewards({"total": torch.arange(8.0)})
+    run.check = check
+    with pytest.raises(InterruptedError, match="stopped by the user"):
+        run.train(buffer)
+    assert (run.version, run.iterations) == (0, 0) and all(
+        torch.equal(value, before[name]) for name, value in weights(run.network).items()
+    )
+    run.check = lambda: None
+    assert run.train(buffer).updates and run.iterations == 1
+    run.close()

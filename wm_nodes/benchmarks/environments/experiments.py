@@ -43,7 +43,7 @@ class InModels(Experiment):
 
     @classmethod
     def add_settings(cls, parser: argparse.ArgumentParser) -> None:
-        options.add_set(parser)
+        options.add_settings(parser)
         options.add_device(parser)
 
     @classmethod
@@ -89,13 +89,8 @@ class TrainedIn(InModels):
         columns = (
             "trained in", "task", "seed", "scenes", "real before", "real after", "gain", "imagined", "acceptance"
         )
-        names = differing(rows)
-        console.print(make_table(
-            "policies trained in each model", (*columns, *(["settings"] if names else [])),
-            [(*line, *([_of_settings(row, names)] if names else [])) for row in rows for line in _lines(row)],
-        ))
-        if names:
-            console.print(f"settings: {', '.join(names)}", soft_wrap=True)
+        lines = [line for row in rows for line in _lines(row)]
+        console.print(make_table("policies trained in each model", columns, lines))
 
 
 @dataclass(kw_only=True)
@@ -127,25 +122,6 @@ class Ranking(InModels):
 def is_finished(rows: Sequence[Mapping[str, Any]], wanted: Mapping[str, Any]) -> bool:
     """Whether one of the rows has all of the wanted values."""
     return any(all(row.get(name) == value for name, value in wanted.items()) for row in rows)
-
-
-def differing(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """The dotted settings, but task and seed, that are not the same in all rows that hold theirs."""
-    known = [_dotted(row["config"]) for row in rows if "config" in row]
-    names = dict.fromkeys(name for settings in known for name in settings)
-    return [name for name in names if len({repr(one.get(name)) for one in known}) > 1 and name not in ("task", "seed")]
-
-
-def _dotted(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat = dict[str, Any]()
-    for name, value in values.items():
-        flat |= _dotted(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
-    return flat
-
-
-def _of_settings(row: dict[str, Any], names: Sequence[str]) -> str:
-    settings = _dotted(row.get("config", {}))
-    return ", ".join(str(settings.get(name, "?")) for name in names)
 
 
 def _outcome(row: dict[str, Any]) -> str:

@@ -108,7 +108,7 @@ def imagination_points(plan: Plan, models: Models) -> Iterator[Point]:
                 *((envs, way) for envs in plan.envs for way in ((EAGER, CAPTURED) if plan.captured else (EAGER,))),
             ]:
                 measure = partial(rate, size=size, px=px, envs=envs, way=way)
-                yield Point("imagination", {**at, "envs": envs, "way": way}, "steps/s", measure, "envs")
+                yield Point("imagination", {**at, "envs": envs, "way": way}, "steps/s", measure)
 
 
 def host_loop(model: Model, envs: int) -> Callable[[int, int, int], Rollout]:
@@ -176,7 +176,7 @@ def training_points(plan: Plan, models: Models) -> Iterator[Point]:
         for name, measure, settings in kinds:
             for batch in sorted({max(1, round(share * settings.batch_size)) for share in plan.batch_shares}):
                 what = {"trained": name, "model": size.name, "px": px, "batch": batch}
-                yield Point("training", what, "ms", partial(measure, size=size, px=px, batch=batch), "batch")
+                yield Point("training", what, "ms", partial(measure, size=size, px=px, batch=batch))
 
 
 @contextmanager

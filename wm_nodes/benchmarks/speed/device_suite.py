@@ -66,8 +66,6 @@ class Plan:
     """Of the repeats of a point."""
     minutes: float = 5.0
     """Points that would begin later are left out."""
-    memory_mib: float | None = None
-    """Of the device that may be used; None: what is free."""
 
 
 SHIPPED = ModelSize("shipped", "cpu_full", (64, 128), shipped_px=64)
@@ -120,17 +118,10 @@ class Point:
     """Of its values."""
     measure: Callable[[Stopwatch], Sequence[float] | Mapping[str, float]]
     """Returns the values of its repeats, or several named numbers."""
-    grows_with: str = ""
-    """The column that its memory grows with."""
 
     @property
     def name(self) -> str:
         return f"{self.group}: {described(self.what)}"
-
-    @property
-    def kin(self) -> str:
-        """The same for points that differ only in the column that memory grows with."""
-        return str([self.group, *((key, value) for key, value in self.what.items() if key != self.grows_with)])
 
 
 class Suite:
@@ -151,7 +142,6 @@ class Suite:
         self.skipped: list[dict[str, str]] = []
         self.state, self.failed = RUNNING, False
         self._watch, self._began = Stopwatch(device, plan.seconds), time.monotonic()
-        self._grown: dict[str, tuple[int, float]] = {}
 
     @property
     def spent_s(self) -> float:
@@ -173,7 +163,7 @@ class Suite:
             self.say(f"interrupted; {len(points) - handled} of {len(points)} points are left out")
 
     def _measure(self, point: Point) -> str:
-        level = self._restart_peak()
+        self._restart_peak()
         try:
             found = point.measure(self._watch)
         except (torch.OutOfMemoryError, MemoryError):
@@ -187,8 +177,6 @@ class Suite:
             gc.collect()
             peak = self._peak()
         numbers = dict(found) if isinstance(found, Mapping) else spread(found)
-        if point.grows_with:
-            self._grown[point.kin] = int(point.what[point.grows_with]), peak - level
         self.results[point.group].append(
             {"point": described(point.what), **point.what, **numbers, "unit": point.unit, "peak_mib": peak}
         )
@@ -198,40 +186,23 @@ class Suite:
     def _reason_to_skip(self, point: Point) -> str:
         if self.spent_s > 60 * self.plan.minutes:
             return self._skip(point, f"the {self.plan.minutes:g} minutes were over")
-        if point.kin not in self._grown:
-            return ""
-        before, grown = self._grown[point.kin]
-        wanted, free = grown * int(point.what[point.grows_with]) / before, self._free_mib()
-        if wanted <= free:
-            return ""
-        return self._skip(
-            point, f"needs about {wanted / 1024:.1f} GiB (it took {grown / 1024:.2f} with {before}), "
-            f"{free / 1024:.1f} GiB are free",
-        )
+        return ""
 
     def _skip(self, point: Point, reason: str, **more: str) -> str:
         self.skipped.append({"point": point.name, "reason": reason, **more})
         return f"left out: {reason}"
 
-    def _restart_peak(self) -> float:
-        """Start the peak anew and return the present level, MiB."""
+    def _restart_peak(self) -> None:
         if self.device.type == CPU:
-            return restart_peak()
+            restart_peak()
+            return
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats(self.device)
-        return torch.cuda.memory_allocated(self.device) / 2**20
 
     def _peak(self) -> float:
         if self.device.type == CPU:
             return memory_mib("VmHWM")
         return torch.cuda.max_memory_allocated(self.device) / 2**20
-
-    def _free_mib(self) -> float:
-        limit = float("inf") if self.plan.memory_mib is None else self.plan.memory_mib
-        if self.device.type == CPU:
-            return min(limit, memory_mib("MemAvailable", "/proc/meminfo"))
-        torch.cuda.empty_cache()
-        return min(limit, torch.cuda.mem_get_info(self.device)[0] / 2**20)
 
 
 def described(what: Mapping[str, Any]) -> str:

@@ -46,7 +46,7 @@ class Speed(Experiment):
 
     @classmethod
     def add_settings(cls, parser: argparse.ArgumentParser) -> None:
-        options.add_set(parser)
+        options.add_settings(parser)
 
     @classmethod
     def settings_of(cls, arguments: argparse.Namespace) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from rich.console import Console
 from torch import nn
 
 from wm_nodes.apps.options import add_preset, positive, settings
-from wm_nodes.config.load import VIDEO, load_video_config, preset_names
+from wm_nodes.config.load import VIDEO, load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import compute_device
@@ -48,7 +48,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--offload", action="store_true", help="VAE and text encoder rest on the CPU")
     parser.add_argument("--lora-rank", type=int, default=0, help="check with a LoRA adapter of this rank")
     parser.add_argument("--contexts", type=positive, default=32, help="contexts whose groups show the head-room")
-    add_preset(parser, "recommended", preset_names(VIDEO))
+    add_preset(parser, "recommended", VIDEO)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -28,6 +28,8 @@ EXIT_CODES = (
 )
 EXPECTED = (RunError, ValueError, OSError, ImportError, FloatingPointError)
 """Errors whose text says what to do; anything else is a fault of this program and shows its traceback."""
+TOP = ("--seed", "--task", "--device")
+"""Settings that are options of a verb, or cannot be given."""
 BENCHMARKS = "benchmarks"
 """Package beside this one in the repository, not installed with it."""
 NO_BENCHMARKS = "the benchmarks come with the repository and are not installed; start launch_scripts/wm.py there"
@@ -75,12 +77,29 @@ GROUPS = {
     },
 }
 VERBS = {name: about for verbs in GROUPS.values() for name, about in verbs.items()}
-"""What each verb does, by its name; `train-policy` is the module wm_nodes.apps.train_policy, `benchmark NAME` an
-experiment of benchmarks.experiment."""
+"""What each verb does, by its name; `train-policy` is the module wm_nodes.apps.train_policy, `judge check` is
+wm_nodes.apps.judge.check, `benchmark NAME` an experiment of benchmarks.experiment."""
 
 
 class Parser(argparse.ArgumentParser):
-    """An ArgumentParser whose errors are one line."""
+    """An ArgumentParser whose errors are one line, and whose `settings` are the settings that were given by name."""
+
+    def parse(self, words: Sequence[str]) -> argparse.Namespace:
+        """Raises ConfigError for a setting without a value, and SystemExit as parse_args."""
+        from wm_nodes.config.load import SCHEMAS, split_settings
+
+        options = self._option_string_actions
+        schema = SCHEMAS.get(self.get_default("settings_of"))
+        names = [name for name in (schema.model_fields if schema else ()) if f"--{name}" not in {*options, *TOP}]
+        rest, settings = split_settings(words, names)
+        arguments, left = self.parse_known_args(rest)
+        taken = getattr(arguments, "settings_of", None)
+        left += [f"--{name}" for name in settings if not taken or (taken not in SCHEMAS and not name.startswith(taken))]
+        if left:
+            close = difflib.get_close_matches(left[0], [*options, *(f"--{name}" for name in names)], n=1)
+            self.error(f"unrecognized arguments: {' '.join(left)}{f'; did you mean {close[0]}?' if close else ''}")
+        arguments.settings = settings
+        return arguments
 
     def error(self, message: str) -> NoReturn:
         self.exit(ERROR, f"error: {message}; see {self.prog} --help\n")
@@ -122,7 +141,7 @@ def run_verb(name: str, argv: Sequence[str], program: str) -> int:
         os.environ.setdefault("TQDM_DISABLE", "1")  # bars of libraries; ours are lines then
     arguments = argparse.Namespace()
     try:
-        arguments = parser_of(name, program).parse_args(argv)
+        arguments = parser_of(name, program).parse(argv)
         arguments.command = shlex.join([*program.split(), *argv])
         run: Callable[[argparse.Namespace], int | None] = arguments.run
         return run(arguments) or DONE
@@ -144,7 +163,7 @@ def parser_of(name: str, program: str) -> Parser:
     with leaving_when_interrupted():
         verb: Any = (
             import_module(f"{BENCHMARKS}.experiment").find_experiment(experiment) if group == "benchmark"
-            else import_module(f"wm_nodes.apps.{name.replace('-', '_').replace(' ', '_')}")
+            else import_module(f"wm_nodes.apps.{name.replace('-', '_').replace(' ', '.')}")
         )
     parser = Parser(
         prog=program, description=inspect.cleandoc(verb.__doc__), epilog=EXIT_CODES,
@@ -157,7 +176,7 @@ def parser_of(name: str, program: str) -> Parser:
 
 def refuse_module(name: str) -> NoReturn:
     """End the process, as `python -m` with the module of a verb would do nothing."""
-    verb = name.rpartition(".")[2].replace("_", "-")
+    verb = name.removeprefix("wm_nodes.apps.").replace("_", "-").replace(".", " ")
     typed = f"wm {verb}" if verb in VERBS else "wm --help"
     raise SystemExit(_fail(f"{name} is not started by itself; type: {typed}"))
 

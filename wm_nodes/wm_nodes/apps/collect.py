@@ -1,6 +1,6 @@
 """Collect episodes of tasks in the simulator into bags: demonstrations, suboptimal trajectories, near misses.
 
-    wm collect FOLDER --tasks pick_place,push --episodes 500 [--set simulation.scenes=ood_object]
+    wm collect FOLDER --tasks pick_place,push --episodes 500 [--simulation.scenes ood_object]
 
 Each task has its own shares of behaviours (data.behaviours). FOLDER/<task>/index.csv lists the episodes,
 FOLDER/success.txt counts successes by behaviour and by scene. The same command goes on where it was interrupted, one
@@ -11,7 +11,7 @@ import argparse
 from pathlib import Path
 
 from wm_nodes.apps.options import add_preset, positive, settings
-from wm_nodes.config.load import load_config, preset_names
+from wm_nodes.config.load import load_config
 from wm_nodes.config.seed_ranges import EVALUATION
 from wm_nodes.config.tasks import task_names
 from wm_nodes.core.files import write_atomic
@@ -23,7 +23,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tasks", required=True, help=f"separated by commas, of {', '.join(task_names())}")
     parser.add_argument("--episodes", type=positive, required=True, help="of each task")
     parser.add_argument("--first-seed", type=int, default=0, help="reset seed of the first (default: 0)")
-    add_preset(parser, "cpu", preset_names())
+    add_preset(parser, "cpu")
 
 
 def run(arguments: argparse.Namespace) -> None:

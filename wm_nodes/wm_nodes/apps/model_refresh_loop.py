@@ -9,7 +9,7 @@ ppo.kl_reference_weight keeps it close to, which is the one the round started fr
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,15 +17,14 @@ from typing import Any
 from rich.table import Table
 
 from wm_nodes.apps import policy_run
-from wm_nodes.apps.policy_run import RunContext, TrainingResult, TrainingStart, WaitingGraph, console, read_success
-from wm_nodes.config.schema import RunConfig
+from wm_nodes.apps.policy_run import RunContext, TrainingResult, TrainingStart, WaitingGraph, read_success
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.model_folder import AGAIN, read_json
-from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import BoolArray
 from wm_nodes.policy_rl import model_refresh
-from wm_nodes.policy_rl.model_refresh import RefreshDecision, round_folder, round_starts
+from wm_nodes.policy_rl.model_refresh import RefreshDecision
 from wm_nodes.reports.console_table import make_table
+from wm_nodes.reports.stages import console
 from wm_nodes.reports.summary import plain
 from wm_nodes.training.metrics import join_metrics
 from wm_nodes.world_model import load_model_folder
@@ -37,49 +36,36 @@ Judge = Callable[[BoolArray, BoolArray | None], None]
 
 @dataclass(frozen=True)
 class ModelRefreshLoop:
-    """What a run's rounds gave. Success: bool (E,), before the first round in its model and after the last in its;
-    real_, None where evaluation.environment is none.
-
-    policy: the weights after the last round. model_dir: what it was trained in. samples, samples_per_s: all rounds'
-    transitions, and their rate (mean of the rounds). bag: of the last round's training. table: one mapping for each
-    round, as in summary.json; empty where there was one round only. stopped: why rounds ended before all their updates.
-    """
+    """What a run's rounds gave. Success: bool (E,), before the first round in its model and after the last in its."""
 
     policy: Path
+    """The weights after the last round."""
     model_dir: Path
+    """What they were trained in."""
     real_before: BoolArray | None
     real_after: BoolArray | None
+    """Success in evaluation.environment; None where that is none."""
     imagined_before: BoolArray
     imagined_after: BoolArray
+    """Success in the model."""
     samples: int
+    """Transitions of all rounds."""
     samples_per_s: float
+    """Mean of the rounds."""
     bag: str
+    """Of the last round's training."""
     table: tuple[dict[str, Any], ...]
+    """A row for each round, as in summary.json; empty where there was one round only."""
     stopped: tuple[str, ...] = ()
-
-
-def split_updates(updates: int, rounds: int) -> list[int]:
-    """Equal shares of the policy updates; the first rounds take the remainder.
-
-    Raises:
-        ValueError: a round would make none.
-    """
-    if rounds > 1 and updates < rounds:
-        raise ValueError(f"ppo.updates is {updates}, fewer than {rounds} rounds; raise it or lower --rounds")
-    share, remainder = divmod(updates, rounds)
-    return [share + (number < remainder) for number in range(rounds)]
+    """Why rounds ended before all their updates."""
 
 
 def round_start(job: RunContext, number: int, model_dir: Path, policy: Path) -> TrainingStart:
     """What round `number`, counted from 1, begins with."""
-    shares = split_updates(job.config.ppo.updates, job.config.model_refresh.num_rounds)
-    start = TrainingStart(_folder(job, number), model_dir, policy, job.config, job.starts)
-    if len(shares) == 1:
-        return start
-    return replace(
-        start, config=round_config(job.config, number, shares[number - 1]), label=f"round {number}",
-        starts=round_starts(job.config, job.run_dir, number, job.starts),
-    )
+    part = model_refresh.round_of(job.config, job.run_dir, number, model_dir, job.starts)
+    several = job.config.model_refresh.num_rounds > 1
+    folder, label = (part.folder, f"round {number}") if several else (job.run_dir, "")
+    return TrainingStart(folder, model_dir, policy, part.config, part.starts, label)
 
 
 def run_rounds(
@@ -89,30 +75,31 @@ def run_rounds(
 
     waiting: the processes of round 1, where they run already.
     """
-    config = job.config
-    shares = split_updates(config.ppo.updates, config.model_refresh.num_rounds)
-    if len(shares) > 1:
-        model_refresh.check_refreshable(model_dir)
+    num_rounds = job.config.model_refresh.num_rounds
     starts, trainings, table = list[TrainingStart](), list[TrainingResult](), list[dict[str, Any]]()
-    for number, updates in enumerate(shares, 1):
-        start = round_start(job, number, model_dir, policy)
-        if len(shares) > 1:
-            job.stage(f"round {number} of {len(shares)}: {updates} updates in {model_dir}")
-        imagined = policy_run.imagined_success(job, start.folder, "before", model_dir, policy)
-        first_only = (partial(judge, imagined), waiting) if number == 1 else ()
+
+    def train(part: model_refresh.Round) -> bool:
+        weights = trainings[-1].policy(starts[-1].folder) if starts else policy
+        start = round_start(job, part.number, part.model_dir, weights)
+        if num_rounds > 1:
+            job.stage(f"round {part.number} of {num_rounds}: {part.config.ppo.updates} updates in {part.model_dir}")
+        imagined = policy_run.imagined_success(job, start.folder, "before", part.model_dir, start.policy)
+        first_only = (partial(judge, imagined), waiting) if part.number == 1 else ()
         trained = policy_run.train_round(job, start, *first_only)
-        policy = trained.policy(start.folder)
-        policy_run.imagined_success(job, start.folder, "after", model_dir, policy)
+        policy_run.imagined_success(job, start.folder, "after", part.model_dir, trained.policy(start.folder))
         starts.append(start)
         trainings.append(trained)
-        if len(shares) > 1:
-            table.append(_finish(job, start, trained, number, last=number == len(shares)))
-            model_dir = start.folder / "model" if table[-1]["verdict"].get("accepted") else model_dir
+        if num_rounds > 1:
+            table.append(_finish(job, start, trained, part.number, last=part.last))
+        return bool(table and table[-1]["verdict"].get("accepted"))
+
+    model_refresh.run_rounds(job.config, job.run_dir, model_dir, job.starts, train)
     first, last = starts[0], starts[-1]
     if table:
         join_metrics([start.folder for start in starts], job.run_dir)
     return ModelRefreshLoop(
-        policy, last.model_dir, read_success(first.folder, "real_before") if job.measures else None,
+        trainings[-1].policy(last.folder), last.model_dir,
+        read_success(first.folder, "real_before") if job.measures else None,
         read_success(last.folder, "real_after") if job.measures else None,
         read_success(first.folder, "imagined_before"), read_success(last.folder, "imagined_after"),
         sum(trained.samples for trained in trainings),
@@ -122,17 +109,6 @@ def run_rounds(
             for start, trained in zip(starts, trainings, strict=True) if trained.stopped
         ),
     )
-
-
-def _folder(job: RunContext, number: int) -> Path:
-    return job.run_dir if job.config.model_refresh.num_rounds == 1 else round_folder(job.run_dir, number)
-
-
-def round_config(config: RunConfig, number: int, updates: int) -> RunConfig:
-    """The configuration of a round: its share of the updates, and from round 2 on a seed of its own, because every
-    round's policy versions, from which the learner's random streams follow, begin at 1."""
-    seed = config.seed if number == 1 else int(numpy_stream(config.seed, "round", number).integers(2**31))
-    return config.model_copy(update={"seed": seed, "ppo": config.ppo.model_copy(update={"updates": updates})})
 
 
 def _finish(

@@ -1,22 +1,48 @@
-"""Options that several verbs have, said once, and the settings that they stand for."""
+"""Options that several verbs have, said once, the settings that they stand for, and the run that they name."""
 
 import argparse
 import os
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from wm_nodes.config.load import judge_overrides, parse_override
+from wm_nodes.config.load import POLICY, VIDEO, Config, judge_overrides, preset_names
 from wm_nodes.core.allocator import keep_freed_memory
+from wm_nodes.core.run_lock import RunLock
+from wm_nodes.training.run_record import Starter, take_up
+
+JUDGE = "judge"
+"""In place of a loop: the settings of the judge."""
+NOT_GIVEN: tuple[Any, ...] = (None, "", [])
+OPTION_OF = {
+    "seed": "--seed", "task": "--task", "rewards": "--reward", "judge.kind": "--judge", "judge.endpoints": "--judge",
+    "judge.folder": "--judge", "judge.model": "--judge-model", "judge.api_key_env": "--judge-key-env",
+    "judge.rubric": "--rubric", "sft.bags": "--demos", "run_folder": "run",
+}
+"""What the user calls settings that have an option of their own, and what is no option."""
 
 
-def add_preset(parser: argparse.ArgumentParser, default: str, names: Sequence[str]) -> None:
-    """--preset and --set. names: the presets that there are."""
-    parser.add_argument("--preset", default=default, help=f"one of {', '.join(names)}, or a .yaml (default: {default})")
-    add_set(parser)
+def add_preset(parser: argparse.ArgumentParser, default: str, loop: str = POLICY) -> None:
+    """--preset, --device and every setting of a loop."""
+    names = ", ".join(preset_names(loop))
+    parser.add_argument("--preset", default=default, help=f"one of {names}, or a .yaml (default: {default})")
+    add_settings(parser, loop)
     add_device(parser)
+
+
+def add_settings(parser: argparse.ArgumentParser, loop: str = POLICY) -> None:
+    """Every setting of a loop, or of its judge alone, as an option: cli.Parser puts those given into
+    `arguments.settings`, by their dotted names."""
+    if parser.get_default("settings_of") is None:
+        example = {POLICY: "ppo.updates 10", VIDEO: "grpo.clip_low 0.1", JUDGE: "judge.max_reads 3"}[loop]
+        parser.add_argument(
+            "--SECTION.KEY", metavar="VALUE", help=f"one of the {loop} settings below, in YAML, e.g. --{example}"
+        )
+        parser.set_defaults(settings_of=loop)
 
 
 def add_device(parser: argparse.ArgumentParser, default: str | None = None) -> None:
@@ -25,10 +51,6 @@ def add_device(parser: argparse.ArgumentParser, default: str | None = None) -> N
     parser.add_argument(
         "--device", default=default, help=f"where models compute: cpu, cuda, cuda:N or auto (default: {shown})"
     )
-
-
-def add_set(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting")
 
 
 def add_seed(parser: argparse.ArgumentParser, default: int | None = 0) -> None:
@@ -54,16 +76,13 @@ def add_json(parser: argparse.ArgumentParser, about: str = "also write the numbe
 
 def add_judge(parser: argparse.ArgumentParser) -> None:
     """Who judges where the reward is the agent's; judge_settings reads them."""
+    add_settings(parser, JUDGE)
     parser.add_argument(
         "--judge", default="", metavar="URL[,URL]|embedded|FOLDER",
         help="the judge's servers, e.g. http://host:8000/v1; or a judge without one (default: embedded)",
     )
     parser.add_argument("--judge-model", default="", metavar="NAME", help="its name on the server")
     parser.add_argument("--judge-key-env", default="", metavar="VARIABLE", help="environment variable with its key")
-    parser.add_argument(
-        "--judge-field", action="append", default=[], metavar="NAME=VALUE",
-        help="further field of every request to it, in YAML, e.g. 'chat_template_kwargs={enable_thinking: false}'",
-    )
     parser.add_argument("--rubric", default="", help="rubric pack: a name, or a .yaml file")
 
 
@@ -87,23 +106,62 @@ def positive(text: str) -> int:
 
 
 def judge_settings(arguments: argparse.Namespace) -> dict[str, Any]:
-    """The dotted settings that the options of add_judge stand for."""
-    fields = dict(parse_override(text) for text in arguments.judge_field)
+    """The dotted settings that the options of add_judge stand for, and those of the judge that were given as such."""
     named = judge_overrides(arguments.judge, arguments.judge_model, arguments.judge_key_env, arguments.rubric)
-    return named | {f"judge.extra_body.{name}": value for name, value in fields.items()}
+    return named | {name: value for name, value in arguments.settings.items() if name.startswith("judge.")}
 
 
 def settings(arguments: argparse.Namespace) -> dict[str, Any]:
-    """The dotted settings that --set and a given --seed or --device stand for."""
-    overrides = dict(parse_override(text) for text in arguments.set) | device_settings(arguments)
+    """The dotted settings that were given, by their names or as --seed or --device."""
     seed = getattr(arguments, "seed", None)
-    return overrides if seed is None else overrides | {"seed": seed}
+    return {**arguments.settings, **device_settings(arguments), **({} if seed is None else {"seed": seed})}
 
 
 def device_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     """The setting that a given --device stands for."""
     device = getattr(arguments, "device", None)
     return {} if device is None else {"device": device}
+
+
+@contextmanager
+def open_run(
+    arguments: argparse.Namespace, starter: Starter[Config], settings: Mapping[str, Any], *,
+    name: Callable[[Config], str], check: Callable[[Config], None],
+) -> Iterator[tuple[Config, Path]]:
+    """Hold the run folder of --run-dir, or a new one, and give its configuration; the starter's options are set in
+    `arguments` to those of the run, paths as text.
+
+    Args:
+        settings: the dotted settings that the given options stand for.
+        name: of a new folder, behind its time.
+        check: raises for a configuration that is no use.
+
+    Raises:
+        ConfigError: see take_up. RunFolderInUseError: see RunLock.
+    """
+    options = {option: _full_paths(getattr(arguments, option)) for option in {**starter.fixed, **starter.free}}
+    given = {option: value for option, value in options.items() if value not in NOT_GIVEN}
+    with ExitStack() as stack:
+        run_dir: Path | None = arguments.run_dir and Path(arguments.run_dir).expanduser().absolute()
+        if run_dir:
+            stack.enter_context(RunLock(run_dir))
+        config, chosen, record = take_up(run_dir, starter, given, settings)
+        vars(arguments).update(chosen)
+        check(config)
+        if not run_dir:
+            new = Path("runs", f"{time.strftime('%Y%m%d-%H%M%S')}-{name(config)}").absolute()
+            run_dir = stack.enter_context(RunLock(new, new=True)).folder
+        record.write(run_dir)
+        yield config, run_dir
+
+
+def _full_paths(value: Any) -> Any:
+    """An option's value as the record holds it: paths in full, also that of a preset's file."""
+    if isinstance(value, list):
+        return [_full_paths(part) for part in value]
+    if isinstance(value, Path) or Path(str(value)).suffix in {".yaml", ".yml"}:
+        return str(Path(value).expanduser().resolve())
+    return value
 
 
 def prepare_torch(count: int | None = None) -> None:

@@ -15,11 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from wm_nodes.config.environments import NO_ENVIRONMENT
-from wm_nodes.config.load import dump_config
-from wm_nodes.config.saved import with_device
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import file_sha256, write_atomic
 from wm_nodes.core.model_folder import AGAIN, files_sha256, read_json
@@ -33,45 +30,34 @@ from wm_nodes.policy_rl.evaluation import evaluate
 from wm_nodes.policy_rl.factories import load_policy, make_imagined_environment, make_video_environment, models_of
 from wm_nodes.policy_rl.initial_policy import num_starts
 from wm_nodes.policy_rl.training_run import POLICY_FILES
+from wm_nodes.reports.stages import Stages
 from wm_nodes.reports.summary import SuccessRate
 from wm_nodes.training.checkpoint import RESTORE
+from wm_nodes.training.run_record import keep_config
 from wm_nodes.video_model.folder import read_video_manifest
 
 READY_S = 120.0
 TRAINED = "trained.json"
 
-console = Console()
-
-
-class Stages:
-    """Prints what is being done, with the minutes since the start."""
-
-    def __init__(self) -> None:
-        self._started = time.monotonic()
-
-    @property
-    def minutes(self) -> float:
-        return (time.monotonic() - self._started) / 60
-
-    def __call__(self, text: str) -> None:
-        minutes, seconds = divmod(int(60 * self.minutes), 60)
-        console.print(f"[dim]{minutes:3d}:{seconds:02d}[/] {text}", highlight=False)
-
-
 @dataclass(frozen=True)
 class RunContext:
-    """What all trainings of a run share. starts: first frames to imagine from. reward: as the launch argument.
-    video_model: folder of the video model to train in; empty: the world model."""
+    """What all trainings of a run share."""
 
     config: RunConfig
     run_dir: Path
     starts: Path
+    """First frames to imagine from."""
     stage: Stages
     domain_id: str = ""
+    """ROS domain; empty: $ROS_DOMAIN_ID, else 0."""
     compose: bool = False
+    """All nodes in one process."""
     verbose: bool = False
+    """Show the nodes' logs."""
     reward: str = "endogenous"
+    """As the launch argument."""
     video_model: str = ""
+    """Folder of the video model to train in; empty: the world model."""
 
     @property
     def measures(self) -> bool:
@@ -90,29 +76,34 @@ class RunContext:
 
 @dataclass(frozen=True)
 class TrainingStart:
-    """What one training begins with. folder: its own run folder. starts: frames to imagine from. label: for bags and
-    messages, e.g. "round 2"."""
+    """What one training begins with."""
 
     folder: Path
+    """Its own run folder."""
     model_dir: Path
     policy: Path
+    """Weights that it starts from."""
     config: RunConfig
     starts: Path
+    """Frames to imagine from."""
     label: str = ""
+    """For bags and messages, e.g. "round 2"."""
 
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """version: of the last weights. samples: transitions trained on. samples_per_s: of the last uninterrupted part.
-    stopped: why training ended before all updates; else empty.
-    """
+    """What one training gave."""
 
     version: int
+    """Of the last weights."""
     updates: int
     samples: int
+    """Transitions trained on."""
     samples_per_s: float
+    """Of the last uninterrupted part."""
     bag: str
     stopped: str = ""
+    """Why training ended before all updates; else empty."""
 
     def policy(self, folder: Path) -> Path:
         return folder / POLICY_FILES.uri(self.version)
@@ -128,17 +119,13 @@ class WaitingGraph:
 
 def start_graph(job: RunContext, start: TrainingStart) -> WaitingGraph:
     """Start the processes of one training; the caller stops the runner."""
-    start.folder.mkdir(parents=True, exist_ok=True)
-    config_file = start.folder / "config.yaml"
-    kept = config_file.read_bytes() if config_file.exists() else dump_config(start.config).encode()
-    write_atomic(config_file, with_device(kept, start.config.device))
+    keep_config(start.config, start.folder)
     name = "_".join(["training", *start.label.split(), time.strftime("%H%M%S")])
     bag = job.run_dir / "bags" / name
     graph, _ = launch_arguments.prepare("online_training", {
-        "config_file": str(config_file), "reward": job.reward, "run_dir": str(start.folder),
+        "reward": job.reward, "run_dir": str(start.folder),
         "model_dir": str(start.model_dir), "starts_file": str(start.starts), "first_frames_file": str(job.starts),
-        "initial_policy": str(start.policy),
-        "seed": str(start.config.seed), "bag_uri": str(bag), "domain_id": job.domain_id,
+        "initial_policy": str(start.policy), "bag_uri": str(bag), "domain_id": job.domain_id,
         "compose": "true" if job.compose else "false", "autostart": "false", **job.environment,
     })
     job.stage("starting the graph: " + ", ".join(node.label for node in graph.nodes))
@@ -251,7 +238,7 @@ def _real(operator: GraphClient, job: RunContext, start: TrainingStart, label: s
             return operator.evaluate(
                 episodes=settings.episodes, seed=settings.first_seed, deterministic=settings.deterministic,
                 label=label, policy_uri=str(policy), on_progress=show,
-            ).success
+            )
 
     identity = {"policy_sha256": file_sha256(policy)}
     success = cached_success(start.folder / "evaluations" / f"real_{label}.json", identity, measure)

@@ -11,8 +11,9 @@ where something differs.
 
 import argparse
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,6 @@ from rich.table import Table
 from torch import Tensor
 
 from wm_nodes.apps.options import add_device, add_json, add_judge, device_settings, judge_settings, prepare_torch
-from wm_nodes.apps.policy_run import console
 from wm_nodes.config.load import REWARDS, judge_or_embedded, load_config, reward_overrides
 from wm_nodes.config.schema import AGENT
 from wm_nodes.config.shipped import shipped_model
@@ -39,7 +39,9 @@ from wm_nodes.policy_rl.rescoring import recorded_model, rescore_bag
 from wm_nodes.recording.bag import is_bag
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reports.console_table import make_table
+from wm_nodes.reports.stages import console
 from wm_nodes.reports.summary import plain, read_summary
+from wm_nodes.training.run_record import CONFIG
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl import recorded_buffers
@@ -69,20 +71,36 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     more.add_argument("--audit", type=Path, help="folder of an audit log to write, where the agent judges")
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """What scoring a recording again gave."""
+
+    equal: bool
+    """Whether all that could be compared is the recorded, bit by bit."""
+    said: Sequence[str | Table]
+    content: Mapping[str, Any]
+    """For the file of --json."""
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Return 0 where all that could be compared is equal, else 1."""
     prepare_torch()
-    bag = _recording(arguments.recording)
-    if not is_bag(bag):
-        equal, content, path = _rescore_clips(arguments)
+    recording, path = _recording(arguments.recording), arguments.json
+    rescore: Callable[[argparse.Namespace, Path], Outcome]
+    if not is_bag(recording):
+        rescore, path = _clips, path or recording / RESCORED
+    elif AGENT in (arguments.reward, recorded_reward_name(recording, namespace=arguments.namespace)):
+        rescore = _episodes
     else:
-        path = arguments.json
-        judged = AGENT in (arguments.reward, recorded_reward_name(bag, namespace=arguments.namespace))
-        rescored = _judge_episodes if judged or judge_settings(arguments) else _rescore_rewards
-        equal, content = rescored(arguments, bag)
+        rescore = _episodes if judge_settings(arguments) else _rewards
+    outcome = rescore(arguments, recording)
+    for part in outcome.said:
+        console.print(part, highlight=False, markup=False, soft_wrap=isinstance(part, str))
     if path is not None:
-        write_atomic(path, (json.dumps(plain({"equal": equal, **content}), indent=1) + "\n").encode())
-    return int(not equal)
+        content = plain({"equal": outcome.equal, **outcome.content})
+        write_atomic(path, (json.dumps(content, indent=1) + "\n").encode())
+        print(f"wrote {path}")
+    return int(not outcome.equal)
 
 
 def _recording(path: Path) -> Path:
@@ -90,45 +108,46 @@ def _recording(path: Path) -> Path:
     return Path(read_summary(path)["bag"]) if (path / "policies").is_dir() else path
 
 
-def _rescore_rewards(arguments: argparse.Namespace, bag: Path) -> tuple[bool, dict[str, Any]]:
+def _rewards(arguments: argparse.Namespace, bag: Path) -> Outcome:
     """The endogenous or rule rewards of a bag of loop 1."""
     if arguments.reward is not None:
         raise ValueError(f"--reward {arguments.reward} is of clips; {bag} holds a policy's episodes")
     model = recorded_model(bag, arguments.config, arguments.model_dir, arguments.device)
     report = rescore_bag(bag, model, namespace=arguments.namespace)
-    print("\n".join([*report.different[:SHOWN], report.text()]))
-    return report.equal, {"compared": report.compared, "different": report.different}
+    said = [*report.different[:SHOWN], report.text()]
+    return Outcome(report.equal, said, {"compared": report.compared, "different": report.different})
 
 
-def _judge_episodes(arguments: argparse.Namespace, bag: Path) -> tuple[bool, dict[str, Any]]:
+def _episodes(arguments: argparse.Namespace, bag: Path) -> Outcome:
     """The episodes of a bag of loop 1 by the reward agent; rewards that it gave live must come out again."""
     run_dir = bag.absolute().parent.parent
-    saved = run_dir / "config.yaml"
+    saved = run_dir / CONFIG
     file = arguments.config or (str(saved) if saved.is_file() else "cpu")
     config = load_config(file, judge_settings(arguments) | device_settings(arguments))
     own, kept = run_dir / "model", Path(file).parent / READS
-    model_dir = arguments.model_dir or (own if own.is_dir() else shipped_model(config.task))
     judge = JudgeService(
         episode_judge(config), seed=config.seed, reads=arguments.reads or (kept if kept.is_dir() else None),
-        audit=arguments.audit, model_dir=model_dir, device=config.device,
+        audit=arguments.audit, device=config.device,
+        model_dir=arguments.model_dir or (own if own.is_dir() else shipped_model(config.task)),
     )
     with closing(judge):
-        found = judge_bag(bag, judge, namespace=arguments.namespace)
-    counts = {status: sum(verdict.status is status for verdict in found.verdicts) for status in Status}
+        judged = judge_bag(bag, judge, namespace=arguments.namespace)
+    counts = {status: sum(verdict.status is status for verdict in judged.verdicts) for status in Status}
     words = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
-    print(f"{len(found.verdicts)} episodes judged ({words or 'none'}), {len(found.unseen)} not seen whole")
-    print(*(f"  {reason}\n" for reason in found.unseen[:SHOWN]), sep="", end="")
-    print(
-        f"{found.compared} recorded lock-steps are of this judge and rubric, {len(found.different)} of them differ; "
-        f"not compared: {found.unanswered} rewards that were not given then"
-    )
-    return not found.different, {"compared": found.compared, "episodes": [verdict_row(v) for v in found.verdicts]}
+    said = [
+        f"{len(judged.verdicts)} episodes judged ({words or 'none'}), {len(judged.unseen)} not seen whole",
+        *(f"  {reason}" for reason in judged.unseen[:SHOWN]),
+        f"{judged.compared} recorded lock-steps are of this judge and rubric, {len(judged.different)} of them differ; "
+        f"not compared: {judged.unanswered} rewards that were not given then",
+    ]
+    content = {"compared": judged.compared, "episodes": [verdict_row(verdict) for verdict in judged.verdicts]}
+    return Outcome(not judged.different, said, content)
 
 
-def _rescore_clips(arguments: argparse.Namespace) -> tuple[bool, dict[str, Any], Path]:
+def _clips(arguments: argparse.Namespace, run_dir: Path) -> Outcome:
     """Every recorded picture of a run of loop 2."""
     chosen = {**reward_overrides(arguments.reward), **judge_settings(arguments), **device_settings(arguments)}
-    run_dir, config = recorded_buffers.read_run(arguments.recording, chosen)
+    run_dir, config = recorded_buffers.read_run(run_dir, chosen)
     device = compute_device(config.device)
     probe, folder = load_probe(shipped_model(config.task), device), load_video_folder(run_dir / "video_model", device)
     bags = recorded_buffers.recorded_episodes(run_dir, "train")
@@ -143,15 +162,12 @@ def _rescore_clips(arguments: argparse.Namespace) -> tuple[bool, dict[str, Any],
                 recorded, contexts, probe, folder.codec, config.rewards, given, judge, first
             ))
     equal = all(not row.different for row in rows)
-    path = arguments.json or run_dir / RESCORED
-    console.print(_table(rows))
-    words = "every score is the recorded one, bit for bit" if equal else "[bold red]scores differ from the bag's[/]"
+    words = "every score is the recorded one, bit for bit" if equal else "scores differ from the bag's"
     if not all(row.same_reward for row in rows):
         words += "; the total is by other rewards than recorded, so it is not compared"
     if silent := sum(row.recorded.audit_ids.count("") for row in rows if row.verdicts):
         words += f"; {silent} clips that got no answer then are not compared"
-    console.print(f"{words}: {path}", highlight=False)
-    return equal, {"rewards": config.rewards, "buffers": [_row(row) for row in rows]}, path
+    return Outcome(equal, [_table(rows), words], {"rewards": config.rewards, "buffers": [_row(row) for row in rows]})
 
 
 @contextmanager

@@ -1,24 +1,34 @@
 """Train a video model on a run's recorded clips and scores, without sampling: the same weights, file for file.
 
-    wm retrain runs/RUN [--run-dir NEW] [--set rewards.scenery=-10]
+    wm retrain runs/RUN [--run-dir NEW] [--rewards.scenery -10]
 
-The run must have kept all of its rollout buffers (train-video-model --keep-buffers). With --set rewards.* the recorded
+The run must have kept all of its rollout buffers (train-video-model --keep-buffers). With --rewards.NAME the recorded
 scores are mixed anew.
 """
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from wm_nodes.apps.options import add_device, add_run_dir, add_set, add_tensorboard, prepare_torch, settings
-from wm_nodes.apps.policy_run import Stages
-from wm_nodes.apps.run_options import open_run
+from wm_nodes.apps.options import (
+    OPTION_OF,
+    add_device,
+    add_run_dir,
+    add_settings,
+    add_tensorboard,
+    open_run,
+    prepare_torch,
+    settings,
+)
 from wm_nodes.apps.video_results import conclude
-from wm_nodes.config.load import load_video_config
+from wm_nodes.config.load import VIDEO, load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import compute_device
 from wm_nodes.core.progress import tqdm
+from wm_nodes.reports.stages import Stages
+from wm_nodes.training.run_record import CONFIG, Starter
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl import recorded_buffers
@@ -31,7 +41,7 @@ from wm_nodes.video_rl.validation import validation_scores
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run_folder", type=Path, metavar="run", help="run folder with all of its rollout buffers")
     add_run_dir(parser)
-    add_set(parser)
+    add_settings(parser, VIDEO)
     add_device(parser)
     add_tensorboard(parser)
     parser.set_defaults(tensorboard=None)
@@ -44,8 +54,8 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.run_dir and arguments.run_dir.expanduser().absolute() == source:
         raise ValueError(f"{source} is the run to train again from; name a new folder with --run-dir")
 
-    def load(file: str, changes: dict[str, Any]) -> VideoRlConfig:
-        return load_video_config(file or str(source / "config.yaml"), changes)
+    def load(file: str, changes: dict[str, Any], chosen: Mapping[str, Any]) -> VideoRlConfig:
+        return load_video_config(file or str(source / CONFIG), changes)
 
     def check(config: VideoRlConfig) -> None:
         compute_device(config.device)
@@ -54,10 +64,11 @@ def run(arguments: argparse.Namespace) -> None:
                 f"the clips of {source} were drawn with seed {live.seed}, not {config.seed}; do not set it"
             )
 
-    with open_run(
-        arguments, "retrain", name=lambda config: "world_model_retrain", load=load, check=check,
-        settings=settings(arguments), fixed=("run_folder",), free=("tensorboard",), defaults={"tensorboard": True},
-    ) as (config, run_dir):
+    starter = Starter("retrain", load, {"run_folder": None}, {"tensorboard": True}, OPTION_OF, prefix="--")
+    opened = open_run(
+        arguments, starter, settings(arguments), name=lambda config: "world_model_retrain", check=check
+    )
+    with opened as (config, run_dir):
         _run(arguments, source, live, config, run_dir)
 
 

@@ -1,7 +1,7 @@
 """Compare RL in the world model with RL in the simulator, over several seeds and tasks, with intervals.
 
 By policy_rl/train.py, in one process: the updates are bit-equal to those of the graph, without its start-up. In the
-world model, model_refresh.num_rounds above 1 trains in rounds, as apps/model_refresh_loop.py does.
+world model, model_refresh.num_rounds above 1 trains in rounds, see policy_rl/model_refresh.py.
 Each (task, seed, arm) is one line of results.jsonl with its settings; a line of the same settings and model is not run
 again. Models that acceptance refuses are trained in all the same, and their lines say so.
 """
@@ -18,10 +18,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from wm_nodes.apps.model_refresh_loop import round_config, split_updates
 from wm_nodes.apps.options import add_preset, add_threads, prepare_torch, settings
 from wm_nodes.apps.policy_run import success_rate
-from wm_nodes.config.load import dump_config, load_config, preset_names
+from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import default_task, model_tasks
@@ -35,20 +34,17 @@ from wm_nodes.environments.registry import make_environment
 from wm_nodes.policy_rl.acceptance import accept_model
 from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
 from wm_nodes.policy_rl.exploit_meter import ExploitMeter, make_exploit_meter
-from wm_nodes.policy_rl.factories import load_policy, make_endogenous_reward, make_imagined_environment
+from wm_nodes.policy_rl.factories import load_policy, make_imagined_environment, make_reward
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import prepare_start
-from wm_nodes.policy_rl.model_refresh import refresh_round, round_folder, round_starts
+from wm_nodes.policy_rl.model_refresh import Round, refresh_round, run_rounds, split_updates
 from wm_nodes.policy_rl.rollouts import rollout_statistics
 from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reports.summary import acceptance_outcome
-from wm_nodes.reward import RewardModel, RuleReward
 from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model.folder import read_world_manifest
 
-FORMER_NAMES = {"gate": "acceptance", "gate_passed": "accepted"}
-"""Of a row's values, in results written before they were renamed."""
 ARMS = ("world_model", "simulator")
 SIMULATOR_ENVS = 8
 IMAGINED_EPISODES = 256
@@ -56,20 +52,23 @@ IMAGINED_EPISODES = 256
 
 @dataclass
 class _Trained:
-    """course: of each update, see _train. model_dir: trained in last. readings: rows of the exploit meter. refreshes:
-    the verdict on each refreshed model."""
+    """What one training gave."""
 
     course: list[dict[str, float]]
+    """Of each update, see _train."""
     model_dir: Path
+    """Trained in last."""
     readings: list[dict[str, float]] = field(default_factory=list)
+    """Rows of the exploit meter."""
     refreshes: list[dict[str, Any]] = field(default_factory=list)
+    """The decision on each refreshed model."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tasks", nargs="+", default=model_tasks(default_task()))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
-    add_preset(parser, "cpu", preset_names())
+    add_preset(parser, "cpu")
     parser.add_argument("--model-dir", type=Path, help="world model; default: the shipped one")
     add_threads(parser)
     parser.add_argument("--out", type=Path, default=Path("runs/study"), help="folder; finished runs in it are kept")
@@ -85,6 +84,9 @@ def run(arguments: argparse.Namespace) -> None:
         for seed in arguments.seeds:
             config = load_config(arguments.preset, {"task": task, "seed": seed, **settings(arguments)})
             compute_device(config.device)
+            if "simulator" in arguments.arms and config.environment.factory != config.evaluation.environment:
+                raise ValueError(f"environment.factory is {config.environment.factory}, and policies are measured in "
+                                 f"evaluation.environment {config.evaluation.environment}; set both to the same")
             model_dir, text = arguments.model_dir or shipped_model(task), dump_config(config)
             configs.add(text)
             made = {"config": text, "world_model_sha256": files_sha256(read_world_manifest(model_dir))}
@@ -107,7 +109,7 @@ def read_results(folder: Path) -> list[dict[str, Any]]:
         except ValueError as error:
             text = f"{path}, line {number} is cut short ({error}); delete the line to do its run again"
             raise ValueError(text) from None
-    return [{FORMER_NAMES.get(name, name): value for name, value in row.items()} for row in rows]
+    return rows
 
 
 def table(rows: Sequence[dict[str, Any]]) -> Table:
@@ -177,13 +179,13 @@ def _plain_items(row: Mapping[str, Any]) -> set[tuple[str, Any]]:
 
 def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path, identity: Mapping[str, Any]) -> None:
     started = time.monotonic()
-    run_dir = folder / f"{config.task}_{config.seed}"
+    run_dir = folder / f"{config.task or 'own'}_{config.seed}"
     starts, weak = prepare_start(config, run_dir, model_dir)
     policy = load_policy(config, model_dir, weak)
     real = make_environment(config, config.evaluation.environment, num_envs=SIMULATOR_ENVS, seed=config.seed)
 
     def measure(folder: Path) -> tuple[EvaluationResult, EvaluationResult]:
-        """In the simulator and in the world model of a folder."""
+        """In evaluation.environment and in the world model of a folder."""
         how = config.evaluation
         imagined = make_imagined_environment(config, folder, starts, num_envs=config.ppo.num_envs, seed=config.seed)
         return (
@@ -225,25 +227,27 @@ def _train_in_rounds(
     policy: ImagePolicy, real: Environment, config: RunConfig, model_dir: Path, first_frames: Path, run_dir: Path
 ) -> _Trained:
     """Train in place."""
-    shares = split_updates(config.ppo.updates, config.model_refresh.num_rounds)
     trained = _Trained([], model_dir)
-    for number, updates in enumerate(shares, 1):
-        part, starts = round_config(config, number, updates), round_starts(config, run_dir, number, first_frames)
+
+    def train(part: Round) -> bool:
         env = make_imagined_environment(
-            part, model_dir, starts, num_envs=config.ppo.num_envs, seed=part.seed, training=True
+            part.config, part.model_dir, part.starts, num_envs=config.ppo.num_envs, seed=part.config.seed, training=True
         )
-        meter = make_exploit_meter(part, model_dir, first_frames, lambda: real)
-        made = sum(shares[: number - 1])
-        trained.course += _train(policy, env, part, "world_model", model_dir, meter)
+        meter = make_exploit_meter(part.config, part.model_dir, first_frames, lambda: real)
+        made = sum(split_updates(config.ppo.updates, config.model_refresh.num_rounds)[: part.number - 1])
+        trained.course += _train(policy, env, part.config, "world_model", part.model_dir, meter)
         trained.readings += [] if meter is None else [{**row, "update": row["update"] + made} for row in meter.rows()]
-        if number == len(shares):
-            break
-        weights = round_folder(run_dir, number) / "policy.safetensors"
+        trained.model_dir = part.model_dir
+        if part.last:
+            return False
+        weights = part.folder / "policy.safetensors"
         weights.parent.mkdir(parents=True, exist_ok=True)
         save_weights(policy, weights, {"tokenizer_sha256": policy.encoder.sha256})
-        verdict = refresh_round(config, model_dir, weights, first_frames, run_dir, number)
+        verdict = refresh_round(config, part.model_dir, weights, first_frames, run_dir, part.number)
         trained.refreshes.append(verdict.to_dict())
-        trained.model_dir = model_dir = weights.with_name("model") if verdict.accepted else model_dir
+        return verdict.accepted
+
+    run_rounds(config, run_dir, model_dir, first_frames, train)
     return trained
 
 
@@ -252,7 +256,7 @@ def _train(
     meter: ExploitMeter | None = None,
 ) -> list[dict[str, float]]:
     """Train in place; return success rate, KL and environment steps of each update."""
-    reward: RewardModel = RuleReward() if arm == "simulator" else make_endogenous_reward(config, model_dir)
+    reward = make_reward(config, None if arm == "simulator" else model_dir)
     course: list[dict[str, float]] = []
     with tqdm(total=config.ppo.updates, desc=f"{config.task} seed {config.seed} in {arm}", unit="update") as bar:
         for rollout, metrics in train_policy(policy, env, reward, config, meter):

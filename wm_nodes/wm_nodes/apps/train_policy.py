@@ -6,6 +6,7 @@ Every stage leaves its files in the run folder and is skipped when they are ther
 
 import argparse
 import json
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import asdict
 from functools import partial
@@ -17,11 +18,9 @@ import numpy as np
 from wm_nodes.apps import options
 from wm_nodes.apps.model_refresh_loop import round_start, run_rounds
 from wm_nodes.apps.policy_pictures import write_pictures
-from wm_nodes.apps.policy_run import RunContext, Stages, console, is_trained, measured_rate, start_graph, success_rate
-from wm_nodes.apps.run_options import open_run
+from wm_nodes.apps.policy_run import RunContext, is_trained, measured_rate, start_graph, success_rate
 from wm_nodes.config.environments import NO_ENVIRONMENT
-from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, load_config, preset_names
-from wm_nodes.config.scenes import SCENES, splits
+from wm_nodes.config.load import ConfigError, dump_config, load_config, with_judge
 from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT
 from wm_nodes.config.shipped import shipped_model
@@ -43,32 +42,28 @@ from wm_nodes.policy_rl.pretraining import make_model
 from wm_nodes.recording import read_spec
 from wm_nodes.reports.html import write_report
 from wm_nodes.reports.machine import machine_facts
+from wm_nodes.reports.stages import Stages, console
 from wm_nodes.reports.summary import Summary, acceptance_outcome, as_first_made, read_readings, write_summary
 from wm_nodes.reports.tables import exploit_table, results_table, rounds_table, tasks_table
+from wm_nodes.training.run_record import Starter
 from wm_nodes.world_model.folder import model_spec, read_world_manifest
 
 ENDOGENOUS = "endogenous"
-ACCEPTANCE, FORMER_ACCEPTANCE = "acceptance.json", "gate.json"
-"""Report of accept_model in the run folder, and its name in older ones."""
-FIXED = ("preset", "model_dir", "from_scratch", "reward", "environment", "video_model")
-FREE = ("force", "compose")
-DEFAULTS = {
-    "preset": "cpu", "from_scratch": False, "reward": ENDOGENOUS, "environment": IMAGINED[0], "force": False,
-    "compose": False,
+ACCEPTANCE = "acceptance.json"
+"""Report of accept_model in the run folder."""
+FIXED = {
+    "preset": "cpu", "model_dir": None, "from_scratch": False, "reward": ENDOGENOUS, "environment": IMAGINED[0],
+    "video_model": None,
 }
-"""Options that a run keeps, see run_options.open_run."""
+FREE = {"force": False, "compose": False}
+"""Options that a run keeps with their defaults, see training/run_record.py."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    options.add_preset(parser, "cpu", preset_names())
+    options.add_preset(parser, "cpu")
     parser.add_argument(
         "--task", choices=("", *task_names()),
         help='default: the preset\'s; "": none, for an environment of your own, with --model-dir and --demos',
-    )
-    parser.add_argument(
-        "--scenes", metavar="NAME",
-        help=f"where the task has many: {', '.join(splits())}, or one scene such as {next(iter(SCENES))}; "
-        "default: train",
     )
     options.add_seed(parser, None)
     options.add_run_dir(parser)
@@ -85,11 +80,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--from-scratch", action="store_true", help="collect data and train the world model too")
     parser.add_argument("--force", action="store_true", help="train even in a model that does not pass acceptance")
     parser.add_argument(
-        "--rounds", type=int, metavar="N",
-        help="train, collect with the policy in the simulator, refresh the world model, N times; default: the preset's "
-        "(1: never refresh). The policy updates are split over the rounds",
-    )
-    parser.add_argument(
         "--reward", choices=(ENDOGENOUS, AGENT),
         help="what the policy is paid for in the world model. endogenous: the model's own signal; agent: a judge's "
         "verdict on each whole episode; name the judge below, or in section judge of the settings. Default: endogenous",
@@ -97,7 +87,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_judge(parser)
     parser.add_argument("--compose", action="store_true", help="all nodes in one process")
     options.add_graph(parser)
-    parser.set_defaults(**dict.fromkeys(DEFAULTS))
+    parser.set_defaults(**dict.fromkeys([*FIXED, *FREE]))
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -108,10 +98,11 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def opened(arguments: argparse.Namespace) -> AbstractContextManager[tuple[RunConfig, Path]]:
-    """The run folder of the options, see open_run."""
-    return open_run(
-        arguments, "train-policy", name=lambda config: config.task or "policy", load=partial(_load, arguments),
-        check=partial(_check, arguments), settings=_settings(arguments), fixed=FIXED, free=FREE, defaults=DEFAULTS,
+    """The run folder of the options, see options.open_run."""
+    starter = Starter("train-policy", _load, FIXED, FREE, options.OPTION_OF, prefix="--")
+    return options.open_run(
+        arguments, starter, _settings(arguments), name=lambda config: config.task or "policy",
+        check=partial(_check, arguments),
     )
 
 
@@ -143,7 +134,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
         imagined_steps_per_s=found.samples_per_s, bag=found.bag,
         paired=_paired(found.real_before, found.real_after),
         imagined_paired=_paired(found.imagined_before, found.imagined_after),
-        acceptance=_read_acceptance(run_dir), samples=found.samples, minutes=stage.minutes,
+        acceptance=read_json(run_dir / ACCEPTANCE, AGAIN), samples=found.samples, minutes=stage.minutes,
         command=arguments.command, machine=machine_facts(config.device), rounds=found.table, reward=arguments.reward,
         exploit_meter=read_readings(run_dir), stopped=found.stopped,
         by_task=_by_task(config, found.real_before, found.real_after),
@@ -190,14 +181,12 @@ def _by_task(config: RunConfig, before: BoolArray | None, after: BoolArray | Non
 def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
     chosen = options.settings(arguments) | options.judge_settings(arguments)
     chosen |= {} if arguments.task is None else {"task": arguments.task}
-    chosen |= {"sft.bags": [str(bag.expanduser().absolute()) for bag in arguments.demos]} if arguments.demos else {}
-    chosen |= {"simulation.scenes": arguments.scenes} if arguments.scenes else {}
-    return chosen | ({} if arguments.rounds is None else {"model_refresh.num_rounds": arguments.rounds})
+    demos = [str(bag.expanduser().absolute()) for bag in arguments.demos or ()]
+    return chosen | ({"sft.bags": demos} if demos else {})
 
 
-def _load(arguments: argparse.Namespace, file: str, changes: dict[str, Any]) -> RunConfig:
-    config = load_config(file, changes)
-    return config.model_copy(update={"judge": judge_or_embedded(config.judge)}) if arguments.reward == AGENT else config
+def _load(file: str, settings: dict[str, Any], chosen: Mapping[str, Any]) -> RunConfig:
+    return with_judge(load_config(file, settings), chosen["reward"])
 
 
 def _check(arguments: argparse.Namespace, config: RunConfig) -> None:
@@ -212,8 +201,8 @@ def _check(arguments: argparse.Namespace, config: RunConfig) -> None:
     for bag in config.sft.bags:
         read_spec(Path(bag))
     if config.model_refresh.num_rounds > 1 and not is_simulated(config):
-        raise ConfigError(f"--rounds {config.model_refresh.num_rounds} collect in the simulator; give 1, or a task and "
-                          "evaluation.environment maniskill")
+        raise ConfigError(f"model_refresh.num_rounds is {config.model_refresh.num_rounds}, and rounds collect in the "
+                          "simulator; give 1, or a task and evaluation.environment maniskill")
     _check_environment(arguments, config)
     if config.exploit_meter.every and config.exploit_meter.episodes > num_starts(config):
         raise ConfigError(f"exploit_meter.episodes is {config.exploit_meter.episodes}, and this run has "
@@ -248,7 +237,10 @@ def _check_environment(arguments: argparse.Namespace, config: RunConfig) -> None
     if arguments.video_model:
         load_steppable(config, Path(arguments.video_model))
         if (rounds := config.model_refresh.num_rounds) > 1:
-            raise ConfigError(f"--rounds {rounds} refreshes a world model, and a video model is trained in; give 1")
+            raise ConfigError(
+                f"model_refresh.num_rounds is {rounds}: that refreshes a world model, and a video model is trained in; "
+                "give 1"
+            )
 
 
 def _check_meter(config: RunConfig, starts: Path, stage: Stages) -> None:
@@ -286,8 +278,3 @@ def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, r
             "Train the model longer or on more data (--from-scratch --preset cpu_full), or go on with --force"
         )
     job.stage(f"acceptance {report.words}" + (", going on because of --force" if report.failed else ""))
-
-
-def _read_acceptance(run_dir: Path) -> dict[str, Any]:
-    path = run_dir / ACCEPTANCE
-    return read_json(path if path.is_file() else run_dir / FORMER_ACCEPTANCE, AGAIN)

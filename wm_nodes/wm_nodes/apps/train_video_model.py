@@ -9,23 +9,21 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from wm_nodes.apps import options
-from wm_nodes.apps.policy_run import READY_S, Stages
-from wm_nodes.apps.run_options import open_run
+from wm_nodes.apps.policy_run import READY_S
 from wm_nodes.apps.video_results import conclude
 from wm_nodes.config.load import (
     REWARDS,
     VIDEO,
-    judge_or_embedded,
     load_config,
     load_video_config,
-    preset_names,
     reward_overrides,
+    with_judge,
 )
 from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT, MODEL_EPISODES
@@ -39,6 +37,8 @@ from wm_nodes.judge.service import clip_fps
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.graph_client import GraphClient
 from wm_nodes.launching.runner import Runner
+from wm_nodes.reports.stages import Stages
+from wm_nodes.training.run_record import Starter
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_rl.pretraining import make_video_model, shipped_video_model
 from wm_nodes.video_rl.recorded_buffers import recorded_bags
@@ -46,13 +46,13 @@ from wm_nodes.video_rl.reference_reward import load_probe
 from wm_nodes.video_rl.training_run import progress
 
 HELDOUT_EPISODES = 100
-FIXED, FREE = ("preset", "from_scratch", "bags", "heldout_bags"), ("keep_buffers", "tensorboard")
-DEFAULTS = {"preset": "recommended", "from_scratch": False, "keep_buffers": 4, "tensorboard": True}
-"""Options that a run keeps, see run_options.open_run."""
+FIXED: dict[str, Any] = {"preset": "recommended", "from_scratch": False, "bags": [], "heldout_bags": []}
+FREE = {"keep_buffers": 4, "tensorboard": True}
+"""Options that a run keeps with their defaults, see training/run_record.py."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    options.add_preset(parser, "recommended", preset_names(VIDEO))
+    options.add_preset(parser, "recommended", VIDEO)
     options.add_seed(parser, None)
     options.add_run_dir(parser)
     parser.add_argument(
@@ -77,7 +77,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_judge(parser)
     options.add_tensorboard(parser)
     options.add_graph(parser)
-    parser.set_defaults(**dict.fromkeys(DEFAULTS))
+    parser.set_defaults(**dict.fromkeys(["preset", "from_scratch", *FREE]))
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -88,13 +88,11 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def opened(arguments: argparse.Namespace) -> AbstractContextManager[tuple[VideoRlConfig, Path]]:
-    """The run folder of the options, see open_run. Raises ValueError for options that do not go together."""
+    """The run folder of the options, see options.open_run. Raises ValueError for options that do not go together."""
     _check_options(arguments)
-    return open_run(
-        arguments, "train-video-model", name=lambda config: "world_model_rl", load=_load, check=_check,
-        settings=options.settings(arguments) | reward_overrides(arguments.reward) | options.judge_settings(arguments),
-        fixed=FIXED, free=FREE, defaults=DEFAULTS,
-    )
+    starter = Starter("train-video-model", _load, FIXED, FREE, options.OPTION_OF, prefix="--")
+    settings = options.settings(arguments) | reward_overrides(arguments.reward) | options.judge_settings(arguments)
+    return options.open_run(arguments, starter, settings, name=lambda config: "world_model_rl", check=_check)
 
 
 def _run(arguments: argparse.Namespace, config: VideoRlConfig, run_dir: Path) -> None:
@@ -158,7 +156,7 @@ def _post_train(
     """GRPO over the graph, from the learner's checkpoint on. bags: of contexts, and of held-out ones."""
     contexts, heldout = (",".join(map(str, some)) for some in bags)
     graph, _ = launch_arguments.prepare("world_model_rl", {
-        "config_file": str(run_dir / "config.yaml"), "run_dir": str(run_dir),
+        "run_dir": str(run_dir),
         "bag_uri": str(run_dir / "bags" / f"world_model_rl_{time.strftime('%Y%m%d_%H%M%S')}"),
         "video_model_dir": str(run_dir / "video_model"), "context_bags": contexts, "heldout_bags": heldout,
         "keep_buffers": str(arguments.keep_buffers), "tensorboard": "true" if arguments.tensorboard else "false",
@@ -193,9 +191,8 @@ def _check_options(arguments: argparse.Namespace) -> None:
         raise ValueError(f"{min(twice)} cannot be trained on and held out; name other --heldout-bags")
 
 
-def _load(file: str, changes: dict[str, Any]) -> VideoRlConfig:
-    config = load_video_config(file, changes)
-    return config.with_values(judge=judge_or_embedded(config.judge)) if config.rewards.get(AGENT) else config
+def _load(file: str, settings: dict[str, Any], chosen: Mapping[str, Any]) -> VideoRlConfig:
+    return with_judge(load_video_config(file, settings))
 
 
 def _check(config: VideoRlConfig) -> None:

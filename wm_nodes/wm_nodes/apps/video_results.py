@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from wm_nodes.apps.policy_run import console
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
@@ -26,6 +25,7 @@ from wm_nodes.reports.curves import curves
 from wm_nodes.reports.film_strip import film_strip
 from wm_nodes.reports.html import Picture
 from wm_nodes.reports.machine import machine_facts
+from wm_nodes.reports.stages import console
 from wm_nodes.reports.summary import as_first_made, write_summary
 from wm_nodes.training.metrics import FILE_NAME, read_metrics
 from wm_nodes.training.weights import load_weights_file

@@ -3,6 +3,8 @@
 presets/policy is of loop 1, presets/video of loop 2; the judge of both is in presets/judge.yaml.
 """
 
+import difflib
+from collections.abc import Collection, Mapping, Sequence
 from copy import deepcopy
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -20,12 +22,11 @@ from wm_nodes.config.video import VideoRlConfig
 PRESETS = resources.files("wm_nodes.config") / "presets"
 POLICY, VIDEO = "policy", "video"
 """Folders of presets, one for each loop."""
+SCHEMAS: dict[str, type[RunConfig] | type[VideoRlConfig]] = {POLICY: RunConfig, VIDEO: VideoRlConfig}
 FREE = ("behaviours", "rewards", "extra_body", "kwargs")
 """Mappings without fixed keys, which are replaced as a whole."""
-FORMER_NAMES = {"gate": "acceptance", "rounds": "model_refresh"}
-"""Sections of configurations saved before they were renamed."""
-GONE = {"model_refresh": ("tolerance",)}
-"""Settings by section that saved configurations may have and nothing reads any more."""
+RECORD = "run"
+"""Section of a run's config.yaml that is no setting: training/run_record.py keeps there what else decides the run."""
 EMBEDDED = "embedded"
 """JudgeConfig.kind of the judge in this process."""
 REWARDS = ("reference", "closeness", AGENT)
@@ -57,7 +58,7 @@ def load_video_config(preset: str = "recommended", overrides: dict[str, Any] | N
 
 
 def _load(schema: type[Config], loop: str, preset: str, overrides: dict[str, Any]) -> Config:
-    values = read_preset("base", loop) | _read(PRESETS / "judge.yaml")
+    values = read_preset("base", loop) | read_yaml(PRESETS / "judge.yaml")
     chosen = read_preset(preset, loop)
     task = overrides.get("task", chosen.get("task", values["task"]))
     if loop == POLICY and task in task_names():
@@ -76,7 +77,7 @@ def _load(schema: type[Config], loop: str, preset: str, overrides: dict[str, Any
 
 def default_judge() -> JudgeConfig:
     """The judge of both loops, as presets/judge.yaml sets it."""
-    return JudgeConfig.model_validate(_read(PRESETS / "judge.yaml")["judge"])
+    return JudgeConfig.model_validate(read_yaml(PRESETS / "judge.yaml")["judge"])
 
 
 def reward_overrides(reward: str | None) -> dict[str, Any]:
@@ -112,21 +113,51 @@ def judge_or_embedded(judge: JudgeConfig) -> JudgeConfig:
     return judge.model_copy(update={"kind": EMBEDDED}) if unnamed else judge
 
 
+def with_judge(config: Config, reward: str | None = None) -> Config:
+    """Where a judge pays, the configuration with the embedded one, if it names none.
+
+    Args:
+        reward: what pays in loop 1; loop 2's settings weigh it.
+    """
+    pays = reward == AGENT or (isinstance(config, VideoRlConfig) and config.rewards.get(AGENT))
+    return config.model_copy(update={"judge": judge_or_embedded(config.judge)}) if pays else config
+
+
 def dump_config(config: SettingsSection) -> str:
     """The resolved configuration as YAML, as saved with every run; its loop's load function reads it back."""
     return str(yaml.safe_dump(config.model_dump(), sort_keys=False))
 
 
-def parse_override(text: str) -> tuple[str, Any]:
-    """Split `section.key=value` from the command line; the value is read as YAML."""
-    name, separator, value = text.partition("=")
-    if not separator or not name:
-        raise ConfigError(f"expected section.key=value, got {text!r}")
+def split_settings(words: Sequence[str], names: Collection[str] = ()) -> tuple[list[str], dict[str, Any]]:
+    """Take the settings out of a command line: `--ppo.updates 10` or `--ppo.updates=10`, the value in YAML.
+
+    Args:
+        names: settings without a dot, which are options otherwise.
+
+    Raises:
+        ConfigError: a setting without a value, or one that is no YAML.
+    """
+    rest, settings, left = list[str](), dict[str, Any](), iter(words)
+    for word in left:
+        option, separator, value = word.partition("=")
+        name = option.removeprefix("--")
+        if name == option or not ("." in name or name in names):
+            rest.append(word)
+            continue
+        text = value if separator else next(left, None)
+        if text is None:
+            raise ConfigError(f"expected a value behind {option}")
+        settings[name] = parse_value(name, text)
+    return rest, settings
+
+
+def parse_value(name: str, text: str) -> Any:
+    """The value of a setting, in YAML, as it is typed. Raises ConfigError."""
     try:
-        return name.strip(), yaml.safe_load(value)
+        return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         reason = getattr(error, "problem", None) or error
-        raise ConfigError(f"value of {text!r} is no YAML: {reason}; quote it if it is text") from None
+        raise ConfigError(f"{text!r} of {name} is no YAML: {reason}; quote it if it is text") from None
 
 
 def preset_names(loop: str = POLICY) -> list[str]:
@@ -141,11 +172,11 @@ def read_preset(name: str, loop: str = POLICY) -> dict[str, Any]:
         ConfigError: neither of them, or as read_yaml.
     """
     if name in preset_names(loop):
-        return _read(PRESETS / loop / f"{name}.yaml")
+        return read_yaml(PRESETS / loop / f"{name}.yaml")
     if Path(name).suffix not in {".yaml", ".yml"}:
         known = ", ".join(preset_names(loop))
         raise ConfigError(f"unknown preset {name!r}; choose one of {known} or give a .yaml file")
-    return _read(Path(name))
+    return {section: values for section, values in read_yaml(Path(name)).items() if section != RECORD}
 
 
 def _merge(base: dict[str, Any], top: dict[str, Any], path: str = "", file: str = "") -> None:
@@ -186,19 +217,12 @@ def refusal(error: ValidationError, where: str, file: str = "") -> ConfigError:
     return ConfigError(f"settings{f' in {file}' if file else ''} refused; see {where}: {'; '.join(refused)}")
 
 
-def _unknown(dotted: str, section: dict[str, Any], file: str = "") -> ConfigError:
-    renamed = f", now called {FORMER_NAMES[dotted]!r}" if dotted in FORMER_NAMES else ""
-    where = f" in {file}" if file else ""
-    return ConfigError(f"unknown setting {dotted!r}{where}{renamed}; known there: {', '.join(map(str, section))}")
-
-
-def _read(path: Traversable) -> dict[str, Any]:
-    """The settings in a file, sections that were renamed since by their names of today, without those that are gone."""
-    found = {FORMER_NAMES.get(name, name): values for name, values in read_yaml(path).items()}
-    for section, names in GONE.items():
-        if isinstance(found.get(section), dict):
-            found[section] = {name: value for name, value in found[section].items() if name not in names}
-    return found
+def _unknown(dotted: str, section: Mapping[str, Any], file: str = "") -> ConfigError:
+    """section: what there is where the last name of `dotted` should be."""
+    parent, dot, last = dotted.rpartition(".")
+    close = difflib.get_close_matches(last, section, n=1)
+    hint = f"did you mean {parent + dot + close[0]!r}?" if close else f"known there: {', '.join(section)}"
+    return ConfigError(f"unknown setting {dotted!r}{f' in {file}' if file else ''}; {hint}")
 
 
 def read_yaml(path: Traversable) -> dict[str, Any]:

@@ -23,10 +23,10 @@ _UNPRINTABLE = re.compile("[\0-\x1f\x7f\x85\u2028\u2029\ud800-\udfff]")
 _MAX_NAME_BYTES, _MAX_PART_BYTES, _SHOWN = 4095, 255, 200
 
 RUN_ENTRIES = frozenset((
-    "acceptance.json", "audit", "bags", "bags.json", "begun_with.json", "buffers", "checkpoints",
-    "composed.params.yaml", "config.yaml", "data", "evaluations", "graph.json", "judge_reads", "launch.json", "logs",
+    "acceptance.json", "audit", "bags", "bags.json", "buffers", "checkpoints",
+    "composed.params.yaml", "config.yaml", "data", "evaluations", "judge_reads", "logs",
     "metrics.jsonl", "model", "pictures", "policies", "report.html", "rounds", "run.lock", "starts.json",
-    "starts.safetensors", "summary.json", "tensorboard", "trained.json", "video_config.yaml", "video_model",
+    "starts.safetensors", "summary.json", "tensorboard", "trained.json", "video_model",
     "video_policies",
 ))
 """What a run keeps in its folder under names of its own."""

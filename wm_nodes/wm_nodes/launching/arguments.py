@@ -1,4 +1,4 @@
-"""From given launch arguments to a graph on disk: run folder, configuration, model; shared by both starters.
+"""From given launch arguments to a graph: run folder, configuration, model; shared by both starters.
 
 `python -m wm_nodes.launching.arguments <scenario>`: arguments as JSON on stdin, the graph as JSON on stdout.
 """
@@ -6,208 +6,210 @@
 import json
 import sys
 from collections.abc import Mapping
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.environments import NO_ENVIRONMENT
 from wm_nodes.config.load import (
-    dump_config,
-    judge_or_embedded,
+    VIDEO,
     judge_overrides,
     load_config,
     load_video_config,
+    parse_value,
     read_yaml,
     reward_overrides,
+    with_judge,
 )
-from wm_nodes.config.schema import AGENT, JudgeConfig, RunConfig
+from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.core.files import write_atomic
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.launching.graph import Graph, GraphError, compose
-from wm_nodes.launching.saved_arguments import (
-    full_paths,
-    keep_arguments,
-    read_arguments,
-    saved_config,
-    settings_of,
-    take_up,
+from wm_nodes.launching.scenarios import (
+    IMAGINED,
+    REAL,
+    argument_table,
+    build_graph,
+    is_setting,
+    parse_arguments,
+    run_folder,
+    scenario_of,
 )
-from wm_nodes.launching.scenarios import IMAGINED, REAL, build_graph, parse_arguments, run_folder
+from wm_nodes.training.run_record import PRESET, Starter, take_up
+
+OF_ONE_START = (
+    "run_dir", "allowed_dirs", "domain_id", "discovery_range", "python", "log_level", "executor", "autostart",
+    "use_sim_time", "respawn", "memory_limit_gib", "compose",
+)
+"""Arguments that a run does not keep."""
+FREE = ("namespace", "params_file", "record", "bag_uri", "rate", "train", "keep_buffers", "tensorboard")
+"""Arguments that are kept and may be given anew."""
+JUDGE = ("judge", "judge_model", "judge_key_env", "rubric")
+SETTINGS = ("task", "seed", "device", *JUDGE)
+"""Arguments that stand for settings; in loop 2 `reward` does, too."""
+ARGUMENT_OF = {
+    "rewards": "reward", "judge.kind": "judge", "judge.endpoints": "judge", "judge.folder": "judge",
+    "judge.model": "judge_model", "judge.api_key_env": "judge_key_env", "judge.rubric": "rubric",
+}
+"""Arguments of another name than the settings that they stand for."""
+FILES = (
+    "params_file", "model_dir", "starts_file", "first_frames_file", "initial_policy", "video_model_dir",
+    "context_bags", "heldout_bags", "bag_uri",
+)
 
 
-def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None) -> dict[str, str]:
-    """Fill what depends on this machine and moment: run_dir (made), config_file (written), model, bag, counts.
+def begin(scenario: str, given: Mapping[str, str]) -> tuple[Graph, dict[str, str]]:
+    """Return the graph of a person's command, and its resolved arguments; an existing run folder goes on with its own.
+
+    Args:
+        given: the arguments that were given, without defaults; settings also as `section.key`.
 
     Raises:
         GraphError: for an unknown argument or value, and where no model is known.
-        ConfigError: for a wrong preset or setting.
+        ConfigError: for a wrong preset or setting, or what differs from the run's.
     """
-    values = parse_arguments(scenario, given)
-    values |= {"reward": "agent"} if scenario == "judge_clips" else {}
-    run_dir = run_folder(scenario, values, now)
-    values["run_dir"] = str(run_dir)
-    if values["params_file"]:
-        values["params_file"] = _check_params(values["params_file"])
-    allowed = [str(Path(folder).expanduser().absolute()) for folder in values["allowed_dirs"].split(":") if folder]
-    allowed += [str(Path(values["bag_uri"]).expanduser().absolute())] if scenario == "replay_offline" else []
-    values["allowed_dirs"] = ":".join(allowed)  # the bag that the user names is one for goals, too
-    given_config = values["config_file"]
-    changes = _judge_settings(values) | settings_of(values.get("set", ""))
-    if "video_preset" in values:
-        return _resolve_video(values, run_dir, changes)
-    if given_config and changes:
-        raise GraphError(f"config_file is given, so {', '.join(changes)} belong into it; leave these arguments out")
-    if given_config:
-        values["config_file"] = str(Path(given_config).expanduser().absolute())
-        config = load_config(values["config_file"])
-    else:
-        seed = values.get("seed", "")
-        config = load_config(
-            values["preset"], {"task": values["task"]} | ({"seed": int(seed)} if seed.isdigit() else {}) | changes
-        )
-        if values.get("reward") == "agent":
-            config = config.model_copy(update={"judge": judge_or_embedded(config.judge)})
-        values["config_file"] = str(run_dir / "config.yaml")
-    if values.get("reward") == "agent":
-        _check_agent(config, values)
-    if values.get("num_envs") == "0":
-        values["num_envs"] = str(config.ppo.num_envs)
-    if config.evaluation.environment == NO_ENVIRONMENT and "simulator" in values:
-        values["simulator"] = "false"
-    if "model_dir" in values and (values["model_dir"] or config.task or values.get("backend") in IMAGINED):
-        values["model_dir"] = _model_dir(values["model_dir"], config.task)
-    if values.get("starts_file") == "" and values["model_dir"]:
-        values["starts_file"] = str(Path(values["model_dir"]) / "starts.safetensors")
-    if "bag_uri" in values:
-        values["bag_uri"] = _bag_uri(values["bag_uri"], scenario, run_dir)
-    run_dir.mkdir(parents=True, exist_ok=True)
-    if not given_config:
-        write_atomic(Path(values["config_file"]), dump_config(config).encode())
-    return values
+    return _make(scenario, given, compare=True)
 
 
-def _judge_settings(values: Mapping[str, str]) -> dict[str, Any]:
-    """The settings that the judge's arguments stand for. Raises GraphError where nobody would be asked by them."""
-    settings = judge_overrides(*(values.get(name, "") for name in ("judge", "judge_model", "judge_key_env", "rubric")))
-    if settings and values["reward"] != "agent":
-        raise GraphError(f"{', '.join(settings)} would change nothing without reward:=agent")
+def prepare(scenario: str, given: Mapping[str, str]) -> tuple[Graph, dict[str, str]]:
+    """begin() for a command that answers for its run folder: nothing is compared with what was started there before."""
+    return _make(scenario, given, compare=False)
+
+
+def _make(scenario: str, given: Mapping[str, str], *, compare: bool) -> tuple[Graph, dict[str, str]]:
+    parse_arguments(scenario, given)
+    run_dir = run_folder(scenario, given)
+    given = {name: _full_paths(name, value) for name, value in given.items() if value or name != PRESET}
+    starter, settings = _starter(scenario), _settings(scenario, given)
+    kept = {name: value for name, value in given.items() if name in {**starter.fixed, **starter.free}}
+    config, options, record = take_up(run_dir, starter, kept, settings, compare=compare)
+    of_start = {name: value for name, value in given.items() if name in OF_ONE_START}
+    values = parse_arguments(scenario, {**options, **of_start, "run_dir": str(run_dir)})
+    _check_judge(scenario, values, config, settings)
+    values = _resolve(scenario, values, config)
+    graph = build_graph(scenario, values)
+    if values.get("compose") == "true":
+        graph = compose(graph, str(run_dir / "composed.params.yaml"))
+    record.write(run_dir)
+    for node in graph.nodes:
+        if node.inside:
+            Path(node.parameter_file).write_text(node.carried_parameters(), encoding="utf-8")
+    return graph, values
+
+
+def _starter(scenario: str) -> Starter[Any]:
+    video = scenario_of(scenario).loop == VIDEO
+    of_settings = (*SETTINGS, "reward") if video else SETTINGS
+    defaults = {argument.name: argument.default for argument in argument_table(scenario)}
+    fixed = {name: default for name, default in defaults.items() if name not in (*OF_ONE_START, *FREE, *of_settings)}
+    fixed[PRESET] = "recommended" if video else "cpu"
+    free = {name: default for name, default in defaults.items() if name in FREE}
+
+    def load(file: str, settings: dict[str, Any], options: Mapping[str, str]) -> RunConfig | VideoRlConfig:
+        if video:
+            return with_judge(load_video_config(file, settings))
+        return with_judge(load_config(file, settings), _reward(scenario, options))
+
+    return Starter(scenario, load, fixed, free, ARGUMENT_OF, joins=True)
+
+
+def _settings(scenario: str, given: Mapping[str, str]) -> dict[str, Any]:
+    """The dotted settings that the arguments stand for."""
+    typed = [name for name, value in given.items() if is_setting(name) or (name == "seed" and value)]
+    settings = {name: parse_value(name, given[name]) for name in typed}
+    settings |= {name: given[name] for name in ("task", "device") if name in given and (given[name] or name == "task")}
+    settings |= judge_overrides(*(given.get(name, "") for name in JUDGE))
+    if scenario_of(scenario).loop == VIDEO and (reward := given.get("reward")):
+        if reward != AGENT:
+            raise GraphError(f"reward {reward!r} is of policies; for the video model give agent or nothing")
+        settings |= reward_overrides(reward)
     return settings
 
 
-def _check_agent(config: RunConfig, values: Mapping[str, str]) -> None:
-    """Before a policy's episodes are judged. A backend of the user's may make images that the settings do not know, and
-    clips in a folder have any size."""
+def _reward(scenario: str, options: Mapping[str, str]) -> str | None:
+    return AGENT if scenario == "judge_clips" else options.get("reward")
+
+
+def _check_judge(
+    scenario: str, values: Mapping[str, str], config: RunConfig | VideoRlConfig, settings: Mapping[str, Any]
+) -> None:
+    """Raise GraphError where a judge is named that nobody asks, or one is needed that cannot judge.
+
+    A backend of the user's may make images that the settings do not know, and clips in a folder have any size.
+    """
+    from wm_nodes.judge.backends.factory import check_judge
     from wm_nodes.judge.episode_reward import check_agent
 
-    _check_judge(config.judge)
-    if values.get("backend") != REAL and "num_envs" in values:
+    pays = _reward(scenario, values) == AGENT if isinstance(config, RunConfig) else config.rewards.get(AGENT)
+    named = [name for name in settings if name.startswith("judge.")]
+    if not pays:
+        if named and "judge" in values:
+            raise GraphError(f"{', '.join(named)} would change nothing without reward:=agent")
+        return
+    try:
+        check_judge(config.judge)
+    except ValueError as error:
+        raise GraphError(f"{error}; as arguments: judge:=<url> judge_model:=<name>") from None
+    if isinstance(config, RunConfig) and values.get("backend") != REAL and "num_envs" in values:
         try:
             check_agent(config, trains="learner_ranks" in values)
         except ValueError as error:
             raise GraphError(str(error)) from None
 
 
-def _check_judge(settings: JudgeConfig) -> None:
-    from wm_nodes.judge.backends.factory import check_judge
-
-    try:
-        check_judge(settings)
-    except ValueError as error:
-        raise GraphError(f"{error}; as arguments: judge:=<url> judge_model:=<name>") from None
-
-
-def _resolve_video(values: dict[str, str], run_dir: Path, changes: dict[str, Any]) -> dict[str, str]:
-    """Loop 2 has settings of its own (config/video.py); the world model gives the judge's position probe."""
-
-    if values["reward"] not in ("", "agent"):
-        raise GraphError(f"reward {values['reward']!r} is of policies; for the video model give agent or nothing")
-    weights = reward_overrides(values["reward"] or None)
-    config = load_video_config(values["config_file"] or values["video_preset"], {**weights, **changes})
-    if config.rewards.get(AGENT):
-        config = config.with_values(judge=judge_or_embedded(config.judge))
-        _check_judge(config.judge)
-    values["model_dir"] = _model_dir(values["model_dir"], config.task)
-    values["bag_uri"] = _bag_uri(values["bag_uri"], "world_model_rl", run_dir)
-    run_dir.mkdir(parents=True, exist_ok=True)
-    if values["config_file"] != (saved := str(run_dir / "video_config.yaml")):
-        write_atomic(Path(saved), dump_config(config).encode())
-    return {**values, "config_file": saved}
-
-
-def begin(scenario: str, given: Mapping[str, str]) -> tuple[Graph, dict[str, str]]:
-    """prepare() for a person's command: an existing run folder goes on with its settings and arguments.
-
-    Args:
-        given: the arguments that were given, without any defaults.
-
-    Raises:
-        As resolve(); ConfigError: given arguments differ from the run's.
-    """
-    parse_arguments(scenario, given)
-    run_dir = run_folder(scenario, given)
-    saved = saved_config(scenario, run_dir)
-    if saved.exists():
-        values = take_up(scenario, given, run_dir)
-        return prepare(scenario, values, {**read_arguments(run_dir).get(scenario, values), **given})
-    try:
-        values = full_paths(given)
-        if values.get("config_file") and saved.name == "config.yaml":
-            write_atomic(saved, dump_config(load_config(values["config_file"])).encode())
-            values["config_file"] = str(saved)
-        return prepare(scenario, values, given)
-    except BaseException:
-        saved.unlink(missing_ok=True)  # nothing has begun
-        raise
-
-
-def prepare(
-    scenario: str, given: Mapping[str, str], kept: Mapping[str, str] | None = None
-) -> tuple[Graph, dict[str, str]]:
-    """Return the graph to start and its resolved arguments; graph.json in the run folder keeps a copy for people.
-
-    kept: the arguments by which the run folder will be known; None: those given.
-    """
-    values = resolve(scenario, given)
-    graph = build_graph(scenario, values)
-    if values.get("compose") == "true":
-        graph = compose(graph, str(Path(values["run_dir"]) / "composed.params.yaml"))
-        for node in graph.nodes:
-            if node.inside:
-                Path(node.parameter_file).write_text(node.carried_parameters(), encoding="utf-8")
-    (Path(values["run_dir"]) / "graph.json").write_text(graph.to_json(), encoding="utf-8")
-    keep_arguments(scenario, given if kept is None else kept, Path(values["run_dir"]))
-    return graph, values
+def _resolve(scenario: str, values: Mapping[str, str], config: RunConfig | VideoRlConfig) -> dict[str, str]:
+    """Fill what follows from the configuration and this machine: seed, counts, model, frames, bag, allowed folders."""
+    allowed = [str(Path(folder).expanduser().absolute()) for folder in values["allowed_dirs"].split(":") if folder]
+    filled = {**values, "seed": str(config.seed)}
+    if values["params_file"]:
+        _check_params(values["params_file"])
+    if isinstance(config, RunConfig):
+        if values.get("num_envs") == "0":
+            filled["num_envs"] = str(config.ppo.num_envs)
+        if config.evaluation.environment == NO_ENVIRONMENT and "simulator" in values:
+            filled["simulator"] = "false"
+    if "model_dir" in values and (values["model_dir"] or config.task or values.get("backend") in IMAGINED):
+        filled["model_dir"] = _model_dir(values["model_dir"], config.task)
+    if values.get("starts_file") == "" and filled["model_dir"]:
+        filled["starts_file"] = str(Path(filled["model_dir"]) / "starts.safetensors")
+    if scenario == "replay_offline":
+        _check_played(values["bag_uri"])
+        allowed.append(values["bag_uri"])  # the bag that the user names is one for goals, too
+    elif values.get("bag_uri") == "":
+        filled["bag_uri"] = str(Path(values["run_dir"]) / "bags" / scenario)
+    return {**filled, "allowed_dirs": ":".join(allowed)}
 
 
 def _model_dir(given: str, task: str) -> str:
     if given:
-        folder = Path(given).expanduser().absolute()
-        if not (folder / "manifest.json").is_file():
-            raise GraphError(
-                f"model_dir {str(folder)!r} holds no manifest.json; give the folder of a trained world model"
-            )
-        return str(folder)
+        if not Path(given, "manifest.json").is_file():
+            raise GraphError(f"model_dir {given!r} holds no manifest.json; give the folder of a trained world model")
+        return given
     try:
         return str(shipped_model(task))
     except FileNotFoundError as error:
         raise GraphError(str(error)) from None
 
 
-def _check_params(given: str) -> str:
-    path = Path(given).expanduser().absolute()
-    if not path.exists():
-        raise GraphError(f"params_file {given!r} does not exist")
-    read_yaml(path)
-    return str(path)
+def _check_params(path: str) -> None:
+    if not Path(path).exists():
+        raise GraphError(f"params_file {path!r} does not exist")
+    read_yaml(Path(path))
 
 
-def _bag_uri(given: str, scenario: str, run_dir: Path) -> str:
-    if scenario == "replay_offline":
-        if not given:
-            raise GraphError("replay_offline needs bag_uri:=<folder of a recorded bag>")
-        if not Path(given).expanduser().exists():
-            raise GraphError(f"bag_uri {given!r} does not exist")
-    return str(Path(given).expanduser().absolute()) if given else str(run_dir / "bags" / scenario)
+def _check_played(bag: str) -> None:
+    if not bag:
+        raise GraphError("replay_offline needs bag_uri:=<folder of a recorded bag>")
+    if not Path(bag).exists():
+        raise GraphError(f"bag_uri {bag!r} does not exist")
+
+
+def _full_paths(name: str, value: str) -> str:
+    """An argument with the full paths of the files that it names, which hold in another working directory too."""
+    if name in (PRESET, "rubric"):
+        is_file = Path(value).suffix in {".yaml", ".yml"}
+    else:
+        is_file = name in FILES or (name == "judge" and Path(value).is_dir())
+    return ",".join(str(Path(part).expanduser().absolute()) for part in value.split(",") if part) if is_file else value
 
 
 def main() -> int:

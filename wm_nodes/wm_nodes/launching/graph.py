@@ -19,23 +19,24 @@ class GraphError(ValueError):
 
 @dataclass(frozen=True)
 class NodeSpec:
-    """One node.
-
-    namespace: absolute, e.g. /wm. required: its end ends the graph, but with respawn it is started again.
-    lifecycle: ready when active, else when visible.
-    ranks: processes under torchrun; rank 0 is the node. environment: variables on top of the graph's.
-    """
+    """One node, whose end ends the graph."""
 
     module: str
+    """That `python -m` starts."""
     name: str
     namespace: str = "/wm"
+    """Absolute."""
     parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
-    required: bool = True
     respawn: bool = False
+    """It is started again instead."""
     lifecycle: bool = True
+    """Ready when active; false: when visible."""
     ranks: int = 1
+    """Processes under torchrun; rank 0 is the node."""
     log_level: str = "info"
+    """Least severity that it logs."""
     arguments: tuple[str, ...] = ()
+    """Of its command line, before those of ROS."""
     inside: tuple["NodeSpec", ...] = ()
     """The nodes that a composed process carries."""
     parameter_file: str = ""
@@ -43,6 +44,7 @@ class NodeSpec:
     extra_parameters: str = ""
     """A parameter file of the user; read last, so it wins."""
     environment: Mapping[str, str] = field(default_factory=dict)
+    """Variables on top of the graph's."""
 
     @property
     def full_name(self) -> str:
@@ -87,11 +89,12 @@ class NodeSpec:
 
 @dataclass(frozen=True)
 class Graph:
-    """The nodes of one scenario; environment: variables of all of them."""
+    """The nodes of one scenario."""
 
     name: str
     nodes: tuple[NodeSpec, ...]
     environment: Mapping[str, str] = field(default_factory=dict)
+    """Variables of all nodes."""
 
     def __post_init__(self) -> None:
         labels = [node.label for node in self.nodes]

@@ -2,7 +2,6 @@
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,17 +26,6 @@ ACCEPT_S = 30.0
 
 class GoalFailed(RunError):
     """A goal ended otherwise than finished; the text is the node's own."""
-
-
-@dataclass(frozen=True)
-class EvaluationOutcome:
-    """success: bool (E,) in seed order. low, high: 95 % Wilson interval. mean_length: steps."""
-
-    success: BoolArray
-    low: float
-    high: float
-    mean_length: float
-    policy_version: int
 
 
 class GraphClient:
@@ -68,8 +56,8 @@ class GraphClient:
     def evaluate(
         self, *, episodes: int, seed: int, deterministic: bool, label: str, policy_uri: str = "",
         on_progress: Callable[[int, float], None] = lambda done, rate: None,
-    ) -> EvaluationOutcome:
-        """Play `episodes` with the newest weights (or those of policy_uri).
+    ) -> BoolArray:
+        """Play `episodes` with the newest weights (or those of policy_uri); return their success, (E,) in seed order.
 
         Raises:
             GoalFailed: the evaluation ended early. PeerLost: no evaluation node, or it ended meanwhile.
@@ -80,10 +68,7 @@ class GraphClient:
         result = self._run(
             self._evaluate, "evaluation", goal, lambda m: on_progress(m.feedback.episodes_done, m.feedback.success_rate)
         )
-        return EvaluationOutcome(
-            np.asarray(result.success, bool), result.success_low, result.success_high, result.mean_length,
-            result.policy_version,
-        )
+        return np.asarray(result.success, bool)
 
     def train(self, updates: int, on_progress: Callable[[Any], None] = lambda feedback: None) -> Train.Result:
         """Make policy updates, fewer where the exploit meter stops them (message says why); on_progress gets
@@ -95,15 +80,14 @@ class GraphClient:
         goal, ends = Train.Goal(updates=updates), (Train.Result.FINISHED, Train.Result.LIMIT)
         return self._run(self._train, "learner", goal, lambda message: on_progress(message.feedback), ends)
 
-    def train_video(self, iterations: int, on_progress: Callable[[Any], None] = lambda feedback: None) -> int:
-        """Post-train the video model on so many buffers; on_progress gets TrainVideo.Feedback. Return the new version.
+    def train_video(self, iterations: int, on_progress: Callable[[Any], None] = lambda feedback: None) -> None:
+        """Post-train the video model on so many buffers; on_progress gets TrainVideo.Feedback.
 
         Raises:
             GoalFailed: the training ended early. PeerLost: no learner, or it ended meanwhile.
         """
         goal = TrainVideo.Goal(iterations=iterations)
-        result = self._run(self._train_video, "learner", goal, lambda message: on_progress(message.feedback))
-        return int(result.policy_version)
+        self._run(self._train_video, "learner", goal, lambda message: on_progress(message.feedback))
 
     def close(self) -> None:
         self._stop.set()

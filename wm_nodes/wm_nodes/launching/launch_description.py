@@ -15,7 +15,7 @@ from wm_nodes.core.run_lock import RunLock
 from wm_nodes.launching.domain_lock import DomainLock
 from wm_nodes.launching.environment import graph_environment, interpreter
 from wm_nodes.launching.graph import RESPAWN_S, Graph, NodeSpec
-from wm_nodes.launching.scenarios import argument_table, parse_arguments, run_folder
+from wm_nodes.launching.scenarios import argument_table, is_setting, parse_arguments, run_folder
 
 LOCKS: list[DomainLock] = []
 """Of the graphs that this process launched, until it ends: ros2 launch runs nothing of ours at its own end."""
@@ -51,7 +51,7 @@ def launch_description(scenario: str) -> Any:
 
 
 def _start(scenario: str, context: Any, names: Iterable[str]) -> list[Any]:
-    """names: of the arguments that were given; others, of including launch files, may be among them.
+    """names: of the arguments and settings that were given; others, of including launch files, may be among them.
 
     Raises:
         RunFolderInUseError, DomainInUseError: another process writes into the run folder, or works on the domain on
@@ -60,7 +60,8 @@ def _start(scenario: str, context: Any, names: Iterable[str]) -> list[Any]:
     from launch.substitutions import LaunchConfiguration
 
     known = {argument.name for argument in argument_table(scenario)}
-    given = {name: LaunchConfiguration(name).perform(context) for name in sorted(known.intersection(names))}
+    chosen = sorted(name for name in names if name in known or is_setting(name))
+    given = {name: LaunchConfiguration(name).perform(context) for name in chosen}
     parse_arguments(scenario, given)
     lock_of_run = RunLock(run_folder(scenario, given), new=not given.get("run_dir"))
     lock_of_run.acquire()  # until this process ends
@@ -92,7 +93,7 @@ def prepare_graph(scenario: str, given: Mapping[str, str], python: str) -> Graph
 
 
 def node_actions(graph: Graph, python: str) -> list[Any]:
-    """One launch_ros Node per NodeSpec; the end of a required one shuts the launch down, or starts it again."""
+    """One launch_ros Node per NodeSpec; the end of one shuts the launch down, or starts it again."""
     environment = graph_environment(graph.environment, python=python)
     return [_action(node, python, {**environment, **node.environment}) for node in graph.nodes]
 
@@ -108,6 +109,6 @@ def _action(node: NodeSpec, python: str, environment: dict[str, str]) -> Any:
     return Node(
         executable=python, arguments=node.program(), namespace=node.namespace,
         ros_arguments=["--log-level", node.log_level, *by_node], additional_env=environment, output="screen", **named,
-        **({"on_exit": Shutdown(reason=f"{node.label} ended")} if node.required and not node.respawn else {}),
+        **({"on_exit": Shutdown(reason=f"{node.label} ended")} if not node.respawn else {}),
         **({"respawn": True, "respawn_delay": RESPAWN_S} if node.respawn else {}),
     )

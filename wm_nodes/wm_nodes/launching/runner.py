@@ -70,8 +70,9 @@ class Runner:
         # Linux signals a child when the *thread* that made it ends; this one lives until stop().
         self._starter: ThreadPoolExecutor | None = None
         self._forks: ForkServer | None = None
-        self._expected: set[str] = set()
+        self._stopping = False
         self.killed = False
+        """Whether a node had to be ended by SIGKILL."""
 
     def start(self) -> None:
         """Start every process.
@@ -142,9 +143,8 @@ class Runner:
     def failure(self) -> tuple[int, str] | None:
         """Exit code (1 to 255) and text of the required node that ended first, or None."""
         ended = [
-            process for label, process in self._processes.items()
-            if process.spec.required and process.ended_at is not None and label not in self._expected
-            and not _comes_back(process)
+            process for process in self._processes.values()
+            if process.ended_at is not None and not self._stopping and not _comes_back(process)
         ]
         if not ended:
             return None
@@ -170,16 +170,9 @@ class Runner:
         """Start again what has ended by itself RESPAWN_S ago and is to come back; wait() does so."""
         for label, process in self._processes.items():
             rested = time.monotonic() - (process.ended_at or 0.0) > RESPAWN_S
-            if rested and label not in self._expected and _comes_back(process):
+            if rested and not self._stopping and _comes_back(process):
                 self._say(f"{process.exit_summary()}; starting it again")
                 self._start(label)
-
-    def kill(self, name: str, number: int = signal.SIGKILL) -> None:
-        """Send a signal to a node's process group; its end is then no failure of the graph."""
-        label = self.graph.node(name).label
-        self._expected.add(label)
-        self._processes[label].signal(number)
-        self.killed = self.killed or number == signal.SIGKILL
 
     def wait_ended(self, name: str, timeout_s: float = 10.0) -> int:
         """Return the exit code (negative: the signal) of a node once it has ended.
@@ -189,25 +182,12 @@ class Runner:
         """
         return self._processes[self.graph.node(name).label].wait(timeout_s)
 
-    def restart(self, name: str) -> None:
-        """Start a node again, ending its old process first if it still runs."""
-        label = self.graph.node(name).label
-        if self._processes[label].running:
-            self._expected.add(label)
-            self._end([self._processes[label]])
-        self._expected.discard(label)
-        self._start(label)
-
     def pid(self, name: str) -> int:
         return self._processes[self.graph.node(name).label].pid
 
-    def output(self, name: str) -> str:
-        """What a node has written so far (its last 1000 lines)."""
-        return self._processes[self.graph.node(name).label].output()
-
     def stop(self) -> None:
         """End everything: SIGINT, 5 s, SIGTERM, 5 s, SIGKILL; then clean shared memory and free the domain."""
-        self._expected |= set(self._processes)
+        self._stopping = True
         self._end(list(self._processes.values()))
         for process in self._processes.values():
             process.close()

@@ -12,7 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from wm_nodes.config.tasks import default_task, task_names
+from wm_nodes.config.tasks import task_names
 from wm_nodes.launching.graph import Graph, GraphError, NodeSpec, ParameterValue
 
 TRUTHS = ("true", "false")
@@ -33,21 +33,23 @@ AGENT_JOIN_S = 600.0
 
 @dataclass(frozen=True)
 class LaunchArgument:
-    """One `name:=value` argument. choices: allowed values; empty where any text is."""
+    """One `name:=value` argument."""
 
     name: str
     default: str
     help: str
+    """Without a full stop at its end."""
     choices: tuple[str, ...] = ()
+    """Allowed values; empty: any text."""
 
 
 ARGUMENTS: tuple[LaunchArgument, ...] = (
-    LaunchArgument("preset", "cpu", "Settings to start from, when config_file is empty: a name or a .yaml file"),
-    LaunchArgument("task", default_task(), "Task, when config_file is empty; empty: none, the spec of the model or "
-                   "the environment says everything", ("", *task_names())),
-    LaunchArgument("set", "", "Settings over those of the preset, when config_file is empty: section.key=value (YAML), "
-                   "separated by semicolons"),
-    LaunchArgument("config_file", "", "Resolved configuration (YAML) of an earlier run; empty: from preset and task"),
+    LaunchArgument("preset", "", "Settings to start from: a name or a .yaml file, e.g. config.yaml of another run; "
+                   "empty: cpu, of the video model recommended"),
+    LaunchArgument("task", "", "Task; not given: the preset's; given as empty: none, the spec of the model or the "
+                   "environment says everything", ("", *task_names())),
+    LaunchArgument("seed", "", "Root seed; empty: the preset's"),
+    LaunchArgument("device", "", "Where models compute: cpu, cuda, cuda:N or auto; empty: the preset's"),
     LaunchArgument("run_dir", "", "Folder for settings, weights, bags and logs; an existing one goes on as it was "
                    "begun; empty: runs/<time>-<scenario>"),
     LaunchArgument("allowed_dirs", "", "Folders, separated by colons, where others may name files, beside run_dir"),
@@ -58,7 +60,6 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("heldout_bags", "", "Bags of held-out contexts, separated by commas; empty: no held-out scores"),
     LaunchArgument("keep_buffers", "4", "Rollout buffers kept in run_dir/buffers; training again needs all of them"),
     LaunchArgument("tensorboard", "false", "Also write the learner's metrics to run_dir/tensorboard", TRUTHS),
-    LaunchArgument("video_preset", "recommended", "Settings of loop 2: a name, or a .yaml file"),
     LaunchArgument("starts_file", "", "Frames to imagine from; empty: starts.safetensors in model_dir"),
     LaunchArgument("first_frames_file", "", "First frames with reset seeds, for the exploit meter; empty: starts_file"),
     LaunchArgument("initial_policy", "", "Weights (safetensors) that the policy and the learner start from"),
@@ -78,7 +79,6 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("simulator_envs", "4", "Environments that the policy is measured in (evaluation.environment)"),
     LaunchArgument("simulator", "true", "Also start them and the evaluation node; not where evaluation.environment "
                    "is none", TRUTHS),
-    LaunchArgument("seed", "0", "Root seed of the environments"),
     LaunchArgument("learner_ranks", "1", "Learner processes under torchrun"),
     LaunchArgument("record", "true", "Also start the recorder", TRUTHS),
     LaunchArgument("bag_uri", "", "Bag folder to write or to play; empty: <run_dir>/bags/<scenario>"),
@@ -103,20 +103,26 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
 
 _BY_NAME = {argument.name: argument for argument in ARGUMENTS}
 _COMMON = (
-    "preset", "task", "set", "config_file", "run_dir", "allowed_dirs", "namespace", "executor", "autostart",
-    "use_sim_time", "log_level", "respawn", "memory_limit_gib", "compose", "domain_id", "discovery_range", "python",
-    "params_file",
+    "preset", "task", "seed", "device", "run_dir", "allowed_dirs", "namespace", "executor", "autostart", "use_sim_time",
+    "log_level", "respawn", "memory_limit_gib", "compose", "domain_id", "discovery_range", "python", "params_file",
 )
 
 
+def is_setting(name: str) -> bool:
+    """Whether an argument is one of the settings that config/schema.py and config/video.py explain."""
+    return "." in name
+
+
 def parse_arguments(scenario: str, given: Mapping[str, str]) -> dict[str, str]:
-    """Return every argument of a scenario with its given or default value.
+    """Return every argument of a scenario with its given or default value; settings are left out.
 
     Raises:
         GraphError: names the argument and what is allowed.
     """
     names = scenario_of(scenario).arguments
     for name, value in given.items():
+        if is_setting(name):
+            continue
         if name not in names:
             close = difflib.get_close_matches(name, names, n=1)
             hint = f"did you mean {close[0]!r}?" if close else f"it has {', '.join(names)}"
@@ -164,7 +170,7 @@ def _node(
     """module: of wm_nodes.nodes; empty: the one of the node's name."""
     namespace = "/" + "/".join(part for part in (arguments["namespace"].strip("/"), below) if part)
     common: dict[str, ParameterValue] = {
-        "config_file": arguments["config_file"],
+        "config_file": str(Path(arguments["run_dir"]) / "config.yaml"),
         "run_dir": arguments["run_dir"],
         "autostart": arguments["autostart"] == "true",
         "executor": arguments["executor"],
@@ -294,24 +300,28 @@ def _judge_clips(arguments: Mapping[str, str]) -> Graph:
 
 @dataclass(frozen=True)
 class Scenario:
-    """A named graph; arguments: names in ARGUMENTS, in the order in which --show-args lists them."""
+    """A named graph."""
 
     name: str
     summary: str
     arguments: tuple[str, ...]
+    """Names in ARGUMENTS, in the order in which --show-args lists them."""
     build: Callable[[Mapping[str, str]], Graph]
+    """From resolved arguments, see launching/arguments.py."""
+    loop: str = "policy"
+    """Whose settings it has: policy or video, as config/load.py says."""
 
 
 _JUDGE = ("judge", "judge_model", "judge_key_env", "rubric")
 _TRAINING = (
     *_COMMON, "model_dir", "starts_file", "first_frames_file", "initial_policy", "backend", "video_model_dir",
-    "reward", "num_envs", "simulator_envs", "simulator", "seed", "learner_ranks", "record", "bag_uri", *_JUDGE,
+    "reward", "num_envs", "simulator_envs", "simulator", "learner_ranks", "record", "bag_uri", *_JUDGE,
 )
 _ROLLOUT = (
-    "model_dir", "starts_file", "initial_policy", "backend", "video_model_dir", "mode", "reward", "num_envs", "seed",
+    "model_dir", "starts_file", "initial_policy", "backend", "video_model_dir", "mode", "reward", "num_envs",
     "record", "bag_uri", *_JUDGE,
 )
-_EVALUATE = (*_COMMON, "model_dir", "initial_policy", "simulator_envs", "seed", "record", "bag_uri")
+_EVALUATE = (*_COMMON, "model_dir", "initial_policy", "simulator_envs", "record", "bag_uri")
 
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
@@ -323,9 +333,9 @@ SCENARIOS: dict[str, Scenario] = {
                  (*_COMMON, "model_dir", "initial_policy", "bag_uri", "rate", "train"), _replay_offline),
         Scenario("evaluate", "Measure a policy in the simulator", _EVALUATE, _evaluate),
         Scenario("world_model_rl", "Post-train the video model by GRPO on clips that it samples",
-                 (*(name for name in _COMMON if name not in ("preset", "task", "compose")), "model_dir",
-                  "video_model_dir", "context_bags", "heldout_bags", "video_preset", "keep_buffers", "tensorboard",
-                  "record", "bag_uri", "reward", *_JUDGE), _world_model_rl),
+                 (*(name for name in _COMMON if name != "compose"), "model_dir", "video_model_dir", "context_bags",
+                  "heldout_bags", "keep_buffers", "tensorboard", "record", "bag_uri", "reward", *_JUDGE),
+                 _world_model_rl, "video"),
         Scenario("judge_clips", "Have the reward agent judge folders of clips (action reward/judge_clips)",
                  (*(name for name in _COMMON if name != "compose"), "model_dir", *_JUDGE), _judge_clips),
     )
@@ -340,6 +350,7 @@ def scenario_of(name: str) -> Scenario:
 
 def describe_arguments(scenario: str) -> str:
     """The text of --show-args."""
+    video = scenario_of(scenario).loop == "video"
     lines = [f"{scenario}: {scenario_of(scenario).summary}", "Arguments (name:=value):"]
     for name in scenario_of(scenario).arguments:
         argument = _BY_NAME[name]
@@ -347,6 +358,8 @@ def describe_arguments(scenario: str) -> str:
             f" One of: {', '.join(choice or '(empty)' for choice in argument.choices)}." if argument.choices else ""
         )
         lines += [f"    {name}:", f"        {argument.help}.{choices} (default: {argument.default!r})"]
+    example, verb = ("grpo.clip_low:=0.1", "train-video-model") if video else ("ppo.num_envs:=8", "train-policy")
+    lines += ["    SECTION.KEY:", f"        Any setting, e.g. {example}; `wm {verb} --help` explains each"]
     return "\n".join(lines)
 
 

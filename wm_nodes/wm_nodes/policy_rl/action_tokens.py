@@ -1,6 +1,6 @@
 """Actions as tokens of a language model, as OpenVLA writes them. Shapes: B batch, A action.
 
-For a vision-language-action policy behind `policy_factory`; ImagePolicy acts in real numbers and needs none. 256 edges,
+For a vision-language-action policy behind `policy.factory`; ImagePolicy acts in real numbers and needs none. 256 edges,
 equally spaced over [-1, 1], make 255 bins, and the last 256 ids of the vocabulary name them from the end.
 """
 

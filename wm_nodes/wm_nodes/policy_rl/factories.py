@@ -25,8 +25,8 @@ from wm_nodes.core.types import Environment, FloatArray, Observation, UInt8Array
 from wm_nodes.environments.cameras import simulated_cameras
 from wm_nodes.environments.registry import configured_spec, make_environment
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy, commanded_range
+from wm_nodes.policy_rl.learner import Learner
 from wm_nodes.policy_rl.ppo import PpoLearner
-from wm_nodes.policy_rl.training_run import Learner
 from wm_nodes.reward import EncoderDistance, EndogenousReward, RewardModel, RuleReward
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import load_weights_file

@@ -16,6 +16,7 @@ from wm_nodes.config.seed_ranges import HELDOUT_ROUNDS, MODEL_EPISODES, ROUNDS, 
 from wm_nodes.config.tasks import recorded_task
 from wm_nodes.core.device import compute_device, explain_memory
 from wm_nodes.core.model_folder import MANIFEST
+from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.statistics import bootstrap_mean, paired_difference
 from wm_nodes.environments.collection import CollectionPlan
 from wm_nodes.environments.record import collect_plan, scripted_plan
@@ -82,8 +83,8 @@ def check_refreshable(model_dir: Path) -> None:
     kind = read_world_manifest(model_dir)["tokenizer"]["kind"]
     if kind != "continuous":
         raise ValueError(
-            f"{model_dir} has tokenizer.kind {kind}; rounds refresh continuous models only: use --rounds 1 or a model "
-            "made with tokenizer.kind=continuous"
+            f"{model_dir} has tokenizer.kind {kind}; rounds refresh continuous models only: set num_rounds to 1, or "
+            "take a model made with tokenizer.kind=continuous"
         )
 
 
@@ -196,6 +197,71 @@ def round_starts(config: RunConfig, run_dir: Path, number: int, first_frames: Pa
     """The starts file of round `number`: with frames of the policy's own episodes where the round before wrote some."""
     own = number > 1 and config.model_refresh.own_starts > 0
     return round_folder(run_dir, number - 1) / STARTS if own else first_frames
+
+
+@dataclass(frozen=True)
+class Round:
+    """One of the rounds of a run: what it trains with."""
+
+    number: int
+    """From 1."""
+    config: RunConfig
+    """The run's with this round's share of the updates and its seed."""
+    model_dir: Path
+    """The world model to train in."""
+    starts: Path
+    """Frames to imagine from."""
+    folder: Path
+    """What the round leaves, where there are several."""
+    last: bool
+
+
+def round_of(config: RunConfig, run_dir: Path, number: int, model_dir: Path, first_frames: Path) -> Round:
+    """Round `number` of a run, counted from 1. Raises ValueError where a round would make no update."""
+    shares = split_updates(config.ppo.updates, config.model_refresh.num_rounds)
+    return Round(
+        number, round_config(config, number, shares[number - 1]), model_dir,
+        round_starts(config, run_dir, number, first_frames), round_folder(run_dir, number), number == len(shares),
+    )
+
+
+def run_rounds(
+    config: RunConfig, run_dir: Path, model_dir: Path, first_frames: Path, train: Callable[[Round], bool]
+) -> None:
+    """Train in rounds, each in the newest model that was taken.
+
+    Args:
+        model_dir: of the first round.
+        train: trains one round and, unless it is the last, refreshes its model; returns whether that one is taken.
+
+    Raises:
+        ValueError: fewer updates than rounds, or a model that cannot be refreshed.
+    """
+    if config.model_refresh.num_rounds > 1:
+        check_refreshable(model_dir)
+    for number in range(1, config.model_refresh.num_rounds + 1):
+        part = round_of(config, run_dir, number, model_dir, first_frames)
+        model_dir = part.folder / "model" if train(part) else model_dir
+
+
+def split_updates(updates: int, rounds: int) -> list[int]:
+    """Equal shares of the policy updates; the first rounds take the remainder.
+
+    Raises:
+        ValueError: a round would make none.
+    """
+    if rounds > 1 and updates < rounds:
+        text = f"ppo.updates is {updates}, fewer than {rounds} rounds; raise it, or lower model_refresh.num_rounds"
+        raise ValueError(text)
+    share, remainder = divmod(updates, rounds)
+    return [share + (number < remainder) for number in range(rounds)]
+
+
+def round_config(config: RunConfig, number: int, updates: int) -> RunConfig:
+    """The configuration of a round: its share of the updates, and from round 2 on a seed of its own, because every
+    round's policy versions, from which the learner's random streams follow, begin at 1."""
+    seed = config.seed if number == 1 else int(numpy_stream(config.seed, "round", number).integers(2**31))
+    return config.model_copy(update={"seed": seed, "ppo": config.ppo.model_copy(update={"updates": updates})})
 
 
 def refresh_round(

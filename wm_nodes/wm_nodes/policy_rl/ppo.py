@@ -35,41 +35,58 @@ SAME_START = 0.1
 @dataclass(frozen=True)
 class PpoMetrics:
     """Means over the samples of the update's minibatches, the one included that target_kl stopped at; see
-    docs/metrics.md.
-
-    approx_kl, kl_reference, entropy: nats. epochs: passes made before target_kl stopped them (fractional).
-    loss_value, explained_variance: NaN without a critic. groups_without_signal, episodes_without_return: see
-        GroupAdvantages; None with one.
-    """
+    docs/metrics.md."""
 
     loss_policy: float
+    """RS-10b."""
     loss_value: float
+    """RS-10c; NaN without a critic."""
     entropy: float
+    """Of the policy, nats."""
     approx_kl: float
+    """Of the policy that acted from the trained one, nats."""
     kl_reference: float
+    """Of the trained policy from the reference, nats."""
     clip_fraction: float
+    """Share of the samples whose ratio was clipped."""
     grad_norm: float
+    """Before clipping."""
     learning_rate: float
+    """Of the actor."""
     explained_variance: float
+    """Of the returns by the critic; NaN without a critic."""
     mean_advantage_std: float
+    """Standard deviation of the advantages trained on."""
     epochs: float
+    """Passes made before target_kl stopped them (fractional)."""
     samples: int
+    """Transitions trained on."""
     groups_without_signal: int | None = None
+    """See GroupAdvantages; None with a critic."""
     episodes_without_return: int | None = None
+    """See GroupAdvantages; None with a critic."""
 
 
 @dataclass(frozen=True)
 class _Samples:
-    """The samples of one rollout to train on, flattened to (B, ...). groups: None with a critic."""
+    """The samples of one rollout to train on, flattened."""
 
     groups: GroupAdvantages | None
+    """None with a critic."""
     features: Tensor
+    """(B, F)."""
     states: Tensor
+    """(B, S)."""
     actions: Tensor
+    """(B, A), as executed."""
     logprobs: Tensor
+    """(B,), of the policy that acted."""
     values: Tensor
+    """(B,), of the critic that acted."""
     advantages: Tensor
+    """(B,)."""
     returns: Tensor
+    """(B,), the critic's targets."""
 
 
 class PpoLearner:
@@ -95,7 +112,7 @@ class PpoLearner:
     def update(
         self, rollout: Rollout | TensorRollout, *, should_stop: Callable[[], bool] | None = None
     ) -> PpoMetrics:
-        """Train on one rollout, of which a TensorRollout is on the policy's device.
+        """Train on one rollout; see Learner.update.
 
         Raises:
             Canceled: should_stop, asked before every minibatch, said so on some rank; nothing has changed then.
@@ -140,7 +157,7 @@ class PpoLearner:
 
     def _update(self, rollout: Rollout | TensorRollout, should_stop: Callable[[], bool] | None) -> PpoMetrics:
         config = self.config
-        samples = self._samples(tensors_of(rollout, self.policy) if isinstance(rollout, Rollout) else rollout)
+        samples = self._samples(tensors_of(rollout, self.policy))
         count = len(samples.actions)
         totals: dict[str, float] = {}
         read = trained = 0

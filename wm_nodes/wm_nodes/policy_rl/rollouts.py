@@ -8,7 +8,7 @@ Shapes: T time, N environments, F features, S state, A action, H W 3 image.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -70,6 +70,9 @@ class TensorRollout:
             raise ValueError("this rollout has no pictures; its Rollout holds them")
         pictures: UInt8Array = self.images[:, envs].cpu().numpy()
         return pictures
+
+
+_R = TypeVar("_R", bound=Rollout | TensorRollout)
 
 
 @torch.no_grad()
@@ -230,14 +233,14 @@ def reward_input(
     )
 
 
-def terminate_at_episode_end(rollout: Rollout) -> Rollout:
+def terminate_at_episode_end(rollout: _R) -> _R:
     """Return the rollout with truncated episodes as terminated ones, for rewards that come once, at the last step.
 
     A truncated episode has its whole reward then. Bootstrapping with the critic's value would count it twice, and an
     episode that fails until its time is over could be worth more than one that succeeds.
     """
     ended = rollout.terminated_TN | rollout.truncated_TN
-    return replace(rollout, terminated_TN=ended, truncated_TN=np.zeros_like(ended))
+    return replace(rollout, terminated_TN=ended, truncated_TN=ended & ~ended)  # type: ignore[arg-type]
 
 
 def rollout_statistics(rollout: Rollout | TensorRollout) -> RolloutStatistics:

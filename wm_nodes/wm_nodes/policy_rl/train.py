@@ -3,10 +3,11 @@ bit for bit. `python -m wm_nodes.policy_rl.train`: a policy learns to reach in t
 `--task ""`: in the environment of environment.factory itself, or in the model of it that --model-dir names."""
 
 import argparse
+import sys
 from collections.abc import Iterator
 from typing import Any
 
-from wm_nodes.config.load import load_config, parse_override
+from wm_nodes.config.load import load_config, split_settings
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.types import Environment, Rollout
 from wm_nodes.policy_rl import acceptance, factories
@@ -39,11 +40,11 @@ def main(words: list[str] | None = None) -> None:
     for name, default in zip(("preset", "task", "device", "model-dir"), ("cpu", "reach", argparse.SUPPRESS, "")):
         parser.add_argument(f"--{name}", default=default)
     parser.add_argument("--updates", dest="ppo.updates", type=int, default=12)
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
-    given = vars(parser.parse_args(words))
     try:
-        folder, changes = given.pop("model_dir"), dict(map(parse_override, given.pop("set")))
-        config = load_config(given.pop("preset"), given | changes)
+        options, settings = split_settings(sys.argv[1:] if words is None else words)
+        given = vars(parser.parse_args(options))
+        folder = given.pop("model_dir")
+        config = load_config(given.pop("preset"), given | settings)
         model = factories.chosen_model(config, folder)
         policy, reward = factories.make_policy(config, model), factories.make_reward(config, model)
         env = factories.make_training_environment(config, model, num_envs=config.ppo.num_envs, seed=config.seed)

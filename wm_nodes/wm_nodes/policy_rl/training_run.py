@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch.distributed
@@ -24,7 +24,7 @@ from wm_nodes.core.model_folder import read_json
 from wm_nodes.core.named_files import CHECKPOINT, read_regular
 from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.image_policy import ImagePolicy
-from wm_nodes.policy_rl.ppo import PpoLearner
+from wm_nodes.policy_rl.learner import Learner
 from wm_nodes.policy_rl.rollouts import Canceled, TensorRollout, rollout_statistics, terminate_at_episode_end
 from wm_nodes.training.checkpoint import RESTORE, DamagedFileError
 from wm_nodes.training.ranks import Ranks, broadcast_rollout
@@ -34,39 +34,30 @@ from wm_nodes.training.weights import PackedWeights, load_weights, pack_weights
 POLICY_FILES = VersionFiles("policies/policy")
 
 
-class Learner(Protocol):
-    """What training needs of an algorithm; ppo.PpoLearner is one, learner.factory names another."""
-
-    def update(self, rollout: Rollout | TensorRollout, *, should_stop: Callable[[], bool] | None = None) -> Any:
-        """Train on one rollout, of another learner than PPO a Rollout; return metrics, a mapping or a dataclass of
-        numbers.
-
-        Raises rollouts.Canceled when should_stop returned True, and FloatingPointError when a loss, gradient or weight
-        is not finite; the weights are then as they were before.
-        """
-        ...
-
-    def save(self, path: Path) -> None:
-        """Write everything that an exact continuation needs (optimiser, counters, random streams), atomically."""
-        ...
-
-    def load(self, path: Path) -> None: ...
 
 
 @dataclass
 class Progress:
-    """Counts over the whole run folder. samples: valid transitions trained on. unfailed: updates in a row, up to the
-    newest, in whose rollouts no episode failed."""
+    """Counts over the whole run folder."""
 
     updates: int = 0
+    """Updates made."""
     version: int = 1
+    """The policy's newest version."""
     samples: int = 0
+    """Valid transitions trained on."""
     dropped_invalid: int = 0
+    """Transitions left out as their step or reward is invalid."""
     dropped_gap: int = 0
+    """Transitions left out as a message about them is missing."""
     dropped_stale: int = 0
+    """Transitions left out as another version acted."""
     mean_return: float = math.nan
+    """Of the newest rollout, see RolloutStatistics."""
     success_rate: float = math.nan
+    """Of the newest rollout, see RolloutStatistics."""
     unfailed: int = 0
+    """Updates in a row, up to the newest, in whose rollouts no episode failed."""
 
 
 class PolicyTraining(TrainingRun):
@@ -120,13 +111,15 @@ class PolicyTraining(TrainingRun):
             OSError: the update was made, but its files were not written; ensure_saved() tries again.
         """
         began = time.perf_counter()
-        if isinstance(rollout, Rollout):
-            trained = terminate_at_episode_end(rollout) if paid_at_end else rollout
+        trained = terminate_at_episode_end(rollout) if paid_at_end else rollout
+        if isinstance(trained, Rollout):
             broadcast_rollout(trained, self.ranks)
-            learner_metrics = self.learner.update(trained, should_stop=should_stop)
-        else:  # of PPO alone, in one process
-            assert isinstance(self.learner, PpoLearner) and self.ranks.size == 1 and not paid_at_end
-            learner_metrics = self.learner.update(rollout, should_stop=should_stop)
+        elif self.ranks.size > 1:
+            raise ValueError(
+                f"device rollouts are for a learner of one process, and this one has {self.ranks.size}; start it "
+                "without torchrun, or without --device-rollouts"
+            )
+        learner_metrics = self.learner.update(trained, should_stop=should_stop)
         statistics = rollout_statistics(rollout)
         metrics = _read_numbers(learner_metrics)
         progress = self.progress

@@ -105,7 +105,7 @@ class DeviceEnvironment(DeviceEpisodes):
         if second and (second.tokenizer_sha256, second.tasks) != (models.tokenizer_sha256, models.tasks):
             raise ValueError(
                 "imagined_environment.second_model has another tokenizer or other tasks than the world model; refresh "
-                "that model (--rounds), or leave it empty"
+                "that model (model_refresh.num_rounds), or leave it empty"
             )
         self.tokenizer_sha256 = models.tokenizer_sha256
         self._fast, self._exact, self._fixed = has_fast_bfloat16(device), exact, fixed

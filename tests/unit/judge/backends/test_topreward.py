@@ -126,6 +126,7 @@ def test_a_judge_that_has_no_probability_of_a_word_is_refused_before_anything_is
 
 
 QUIET = "chat_template_kwargs={enable_thinking: false}"
+FIELD = "--judge.extra_body."
 
 
 @pytest.mark.parametrize("limit", ["max_tokens", "max_completion_tokens"])
@@ -138,7 +139,7 @@ def test_fields_of_the_command_line_go_with_every_kind_of_call_as_they_are_given
     for mode, labels in (("benchmark", {"C": 0.9, "A": 0.1}), ("topreward", TRUE_OR_FALSE)):
         with serving(ChatServer(labels=labels, level=2)) as server:
             command = ["judge-clips", str(tmp_path), "--judge", server.url, "--judge-model", "judge", "--mode", mode]
-            assert main([*command, *(word for field in fields for word in ("--judge-field", field))]) in (0, 1)
+            assert main([*command, *(FIELD + field for field in fields)]) in (0, 1)
         for body in server.requests:
             assert body.items() >= given.items() and (limit == "max_tokens" or "max_tokens" not in body)
             kinds.add("json" if "response_format" in body else "truth" if "Decide whether" in json.dumps(body) else "A")
@@ -151,6 +152,6 @@ def test_a_field_that_only_the_judge_may_set_is_refused_on_the_command_line(
 ) -> None:
     write_clips(tmp_path)
     command = ["judge-clips", str(tmp_path), "--judge", "http://127.0.0.1:9/v1", "--judge-model", "m"]
-    assert main([*command, "--judge-field", f"{name}=1"]) == 2
+    assert main([*command, f"{FIELD}{name}=1"]) == 2
     assert f"judge.extra_body sets {name}, which the judge sets itself" in capsys.readouterr().err
-    assert main([*command, "--judge-field", "nonsense"]) == 2
+    assert main([*command, f"{FIELD}{name}"]) == 2

@@ -75,6 +75,7 @@ def test_a_still_object_in_colour_is_none_and_its_edits_are_left_out() -> None:
     assert edited("robot_stays", 4, grey) is not None, "what moves can still stop"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("edit", EDITS, ids=lambda edit: edit.name)
 def test_an_edit_keeps_the_clips_form_is_repeatable_and_grows_with_its_step(edit: Edit) -> None:
     frames = pushed()
@@ -96,6 +97,7 @@ def test_an_edit_keeps_the_clips_form_is_repeatable_and_grows_with_its_step(edit
     assert np.array_equal(frames, kept), "the clip itself is left as it was"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(2, 48, 48), (40, 90, 160), (9, 64, 192)])
 @pytest.mark.parametrize("edit", EDITS, ids=lambda edit: edit.name)
 def test_any_size_and_length_will_do(edit: Edit, shape: tuple[int, int, int]) -> None:

@@ -180,6 +180,7 @@ def odd_clip(name: str, frames: int, height: int, width: int) -> UInt8Array:
     return clip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frames", [2, 3, 4, 9])
 @pytest.mark.parametrize(("height", "width"), [(64, 128), (17, 46)])
 def test_every_number_is_finite_of_every_clip_and_reference(frames: int, height: int, width: int) -> None:

@@ -29,19 +29,15 @@ class DeviceRollouts:
         self._made_for: tuple[object, ...] = ()
         self.left_out: list[str] = []
 
-    def begin(
-        self, check: Check, training: PolicyTraining, config: RunConfig, model_dir: str
-    ) -> "DeviceRollouts":
+    def begin(self, check: Check, training: PolicyTraining, config: RunConfig, model_dir: str) -> "DeviceRollouts":
         """Be the source of a goal. check: as ReplayedRollouts's.
 
         Raises:
-            ValueError: the environment is no world model, or the learner is not PPO; as DeviceCollector.
+            ValueError: the environment is no world model; as DeviceCollector.
         """
         environment = self._environment()
         if not isinstance(environment, ImaginedEnvironment):
             raise ValueError("device rollouts need an environment with backend world_model in the same process")
-        if factory := config.learner.factory:
-            raise ValueError(f"learner.factory is {factory}, and device rollouts are for PPO; leave out one")
         if self._collector is None or self._made_for != (environment, training.policy):
             reward = make_reward("endogenous", config, model_dir)
             self._collector = DeviceCollector(DeviceEnvironment.beside(environment), training.policy, reward)

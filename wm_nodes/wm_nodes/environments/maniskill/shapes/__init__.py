@@ -4,5 +4,5 @@
    separated by commas), for example `WM_SHAPES=my_robot.shapes`. The name is one lower-case word.
 2. In it, SHAPE = Shape(...), whose fields are explained in environments/maniskill/shape.py; sphere.py is a pattern.
    Meshes are as good as primitives: the builder is SAPIEN's. The gripper opens to 8 cm.
-3. Its scenes are of every colour, container and table, in no split: `--scenes red_<name>-bowl-grey_table`.
+3. Its scenes are of every colour, container and table, in no split: `--simulation.scenes red_<name>-bowl-grey_table`.
 """

@@ -9,6 +9,7 @@ by us. What a model is worth as a judge, wm judge check measures.
 
 import argparse
 import json
+import shlex
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -83,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     for model in fitting:
         print(f"{model.memory_gb} GB: {model.name}, {model.about}")
         print(f"  {server_line(model)}")
-        print(f"  wm judge check {URL} --model {model.name}{''.join(f' --set {one}' for one in set_options(model))}\n")
+        print(" ", *(f"wm judge check {URL} --model {model.name}", *set_options(model)), "\n")
     print(_cost(load_rubric("robot")))
     print(NOTES)
     return 0
@@ -100,9 +101,9 @@ def server_line(model: ServedModel) -> str:
 
 
 def set_options(model: ServedModel) -> list[str]:
-    """Our settings for it, as values of --set."""
+    """Our settings for it, as options."""
     values = {"max_images": MOST_IMAGES, **model.settings}
-    return [f"'judge.{name}={json.dumps(value)}'" for name, value in values.items()]
+    return [f"--judge.{name} {shlex.quote(json.dumps(value))}" for name, value in values.items()]
 
 
 def _cost(rubric: Rubric) -> str:
@@ -127,7 +128,7 @@ def _cost(rubric: Rubric) -> str:
 
 
 NOTES = """
-Settings, as above by --set, or in the section judge of a preset:
+Settings, as options above, or in the section judge of a preset:
   label_token_ids: ids of A to E, so that a letter's probability is known however small it is (vLLM 0.32 or later).
     Those of Qwen3-VL are given; of another model ask the server:
     curl 127.0.0.1:8000/tokenize -d '{"model": NAME, "prompt": "A", "add_special_tokens": false}'

@@ -2,7 +2,7 @@
 
     wm judge check http://127.0.0.1:8000/v1 --model Qwen/Qwen3-VL-8B-Instruct
     wm judge check embedded
-    wm judge check URL --model NAME --limit 16 --set 'judge.extra_body={chat_template_kwargs: {enable_thinking: false}}'
+    wm judge check URL --model NAME --limit 16 --judge.extra_body '{chat_template_kwargs: {enable_thinking: false}}'
 
 132 clips of robot tasks, half of them clean or edited so slightly that they must pass, half with a fault of the
 picture, of time or of physics. Asked: some questions twice; every clip in mode reward, then in mode benchmark. Printed:
@@ -23,7 +23,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from wm_nodes.apps.options import add_device, add_json, add_set, positive, settings
+from wm_nodes.apps.options import add_device, add_json, add_settings, positive, settings
 from wm_nodes.config.load import judge_or_embedded, judge_overrides, load_config
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.progress import tqdm
@@ -43,7 +43,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--limit", type=positive, metavar="N", help="only so many clips, evenly from all kinds")
     parser.add_argument("--reads", type=Path, metavar="FOLDER",
                         help="folder that keeps a server's answers; the same command goes on with them")
-    add_set(parser)
+    add_settings(parser)
     add_device(parser)
     add_json(parser)
 

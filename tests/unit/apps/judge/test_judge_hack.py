@@ -50,7 +50,7 @@ def test_clips_that_are_not_paid_are_not_attacked_and_one_error_says_so(
 @pytest.mark.rendering
 def test_the_shipped_judge_holds_on_the_episodes_of_a_bag(tmp_path: Path) -> None:
     recorded = ["collect", str(tmp_path), "--tasks", "push_cube", "--episodes", "2", "--first-seed", "910000"]
-    assert main([*recorded, "--set", "data.behaviours={expert: 1.0}"]) in (0, None)
+    assert main([*recorded, "--data.behaviours", "{expert: 1.0}"]) in (0, None)
     found = tmp_path / "hack.json"
     attack = ["judge", "hack", str(tmp_path), "--judge", "embedded", "--limit", "0.3", "--json", str(found)]
     assert main(attack) == 0

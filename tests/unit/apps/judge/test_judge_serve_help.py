@@ -8,8 +8,8 @@ import sys
 import pytest
 
 from wm_nodes.apps.cli import main
-from wm_nodes.apps.judge_serve_help import MODELS, server_line, set_options
-from wm_nodes.config.load import load_config, parse_override
+from wm_nodes.apps.judge.serve_help import MODELS, server_line, set_options
+from wm_nodes.config.load import load_config, split_settings
 from wm_nodes.judge.backends.factory import check_judge
 
 
@@ -29,7 +29,7 @@ def test_every_line_allows_what_our_settings_send() -> None:
     for model in MODELS:
         words = shlex.split(server_line(model))
         limit = json.loads(words[words.index("--limit-mm-per-prompt") + 1])
-        overrides = dict(parse_override(shlex.split(text)[0]) for text in set_options(model))
+        _, overrides = split_settings(shlex.split(" ".join(set_options(model))))
         judge = load_config("cpu", {"judge.endpoints": ["http://x/v1"], "judge.model": model.name, **overrides}).judge
         check_judge(judge)
         assert judge.max_images == limit["image"] >= 23 and limit["video"] == 1

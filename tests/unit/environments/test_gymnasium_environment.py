@@ -1,0 +1,98 @@
+"""An environment of Gymnasium by settings: its actions, pictures, state, success and limit, and what is refused."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from drawn_pendulum import SETTINGS
+from gymnasium import spaces
+
+from wm_nodes.config.load import ConfigError, load_config
+from wm_nodes.core.types import Environment
+from wm_nodes.environments.registry import configured_spec, make_environment
+
+
+class Seesaw(gymnasium.Env[dict[str, Any], np.ndarray]):
+    """Shows its own pictures and says what it was told; `terminated` is a fall, info["level"] the success."""
+
+    def __init__(self) -> None:
+        picture, angle = spaces.Box(0, 255, (8, 12, 3), np.uint8), spaces.Box(-1.0, 1.0, (1,))
+        self.observation_space = spaces.Dict({"camera": picture, "angle": angle, "goal": spaces.Box(-1.0, 1.0, (2,))})
+        self.action_space = spaces.Box(np.array([0.0, -2.0]), np.array([4.0, 2.0]), dtype=np.float64)
+
+    def reset(self, **_: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        return self._shown(0.0), {}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        self.taken = action
+        return self._shown(action[0] / 4), 0.0, bool(action[1] < -1), False, {"level": action[1] > 1}
+
+    def _shown(self, angle: float) -> dict[str, Any]:
+        camera = np.full((8, 12, 3), 200, np.uint8)
+        return {"camera": camera, "angle": np.array([angle], np.float32), "goal": np.float32([0.5, -0.5])}
+
+
+gymnasium.register("seesaw-v0", entry_point=Seesaw)
+SEESAW = {
+    "task": "", "environment.factory": "gymnasium", "gymnasium.env_id": "seesaw-v0", "gymnasium.pixels": "camera",
+    "gymnasium.state": ["angle", "goal"], "gymnasium.image_size": [4, 6], "gymnasium.success": "level",
+    "gymnasium.kwargs": {"max_episode_steps": 5}, "gymnasium.instruction": "keep it level",
+}
+
+
+def made(settings: dict[str, Any], num_envs: int = 2) -> Environment:
+    config = load_config("smoke", settings)
+    return make_environment(config, config.environment.factory, num_envs=num_envs, seed=0)
+
+
+def test_the_spec_names_what_the_settings_choose() -> None:
+    spec = configured_spec(load_config("smoke", SEESAW), 3)
+    assert (spec.env_id, spec.instruction, spec.num_envs) == ("gymnasium/seesaw-v0", "keep it level", 3)
+    assert (spec.height, spec.width, spec.cameras, spec.max_episode_steps) == (4, 6, ("camera",), 5)
+    assert spec.state_names == ("angle.0", "goal.0", "goal.1") and spec.measured == (0, 1, 2)
+    assert spec.action_scale == (2.0, 2.0)
+
+
+def test_actions_are_scaled_to_its_box_and_pictures_to_the_size() -> None:
+    environment = made(SEESAW)
+    shown = environment.reset()
+    assert shown.image.shape == (2, 4, 6, 3) and (shown.image == 200).all()
+    result = environment.step(np.array([[1, 0], [-1, 0.5]], np.float32))
+    np.testing.assert_allclose(result.observation.state, [[1, 0.5, -0.5], [0, 0.5, -0.5]])
+
+
+def test_success_is_what_info_says_and_a_fall_truncates() -> None:
+    environment = made(SEESAW)
+    environment.reset()
+    result = environment.step(np.array([[0, 0.9], [0, -0.9]], np.float32))
+    assert result.terminated.tolist() == [True, False] and result.truncated.tolist() == [False, True]
+    assert result.success_probability.tolist() == [1.0, 0.0]
+
+
+def test_a_seed_decides_an_episode_in_whichever_copy() -> None:
+    environment = made(SETTINGS)
+    shown = environment.reset(seeds=np.array([7, 7], np.uint64))
+    np.testing.assert_array_equal(shown.state[0], shown.state[1])
+    assert (environment.reset().state[0] != shown.state[0]).any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"gymnasium.env_id": "absent-v0"}, "gymnasium.env_id 'absent-v0' .*package:name"),
+        ({"gymnasium.env_id": "CartPole-v1"}, r"takes actions of Discrete\(2\)"),
+        ({"gymnasium.kwargs": {}}, "sets no limit to an episode; give gymnasium.kwargs max_episode_steps"),
+        ({"gymnasium.state": ["speed"]}, r"no 'speed'; .* may name \['angle', 'camera', 'goal'\]"),
+        ({"gymnasium.pixels": "angle"}, r"pixels 'angle' gives float32 \(1,\), not uint8 \(H, W, 3\)"),
+        ({"environment.factory": "mujoco"}, "no environment 'mujoco'; choose one of maniskill, gymnasium"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_value_and_remedy(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        made({**SEESAW, **changes}).reset()
+
+
+def test_a_factory_of_a_wrong_form_is_refused_with_the_settings() -> None:
+    with pytest.raises(ConfigError, match=r"reward\.factory: a factory is written module:callable .got 'mine'"):
+        load_config("smoke", {"reward.factory": "mine"})

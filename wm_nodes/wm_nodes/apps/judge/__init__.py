@@ -1,0 +1,1 @@
+"""The verbs `wm judge ...`: what a judge is good for, and how one is made."""

@@ -1,0 +1,191 @@
+"""The record of a run, config.yaml in its folder, by which the folder alone goes on with the run.
+
+    seed: 0                       # the settings, all of them
+    ppo: {updates: 24, ...}
+    run:                          # what else decides the run
+      preset: cpu
+      settings_sha256: ...        # without the device, which may change
+      options:                    # by the command or launch file that was started in the folder
+        train-policy: {reward: endogenous, model_dir: null, ...}
+        online_training: {reward: endogenous, num_envs: '0', ...}
+
+Options and settings that are given again must be those of the record; what may differ takes effect and is kept.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Generic
+
+import yaml
+
+from wm_nodes.config.load import RECORD, Config, ConfigError, read_yaml
+from wm_nodes.config.sections import SettingsSection
+from wm_nodes.core.files import write_atomic
+
+CONFIG, DEVICE, PRESET = "config.yaml", "device", "preset"
+MOST_NAMED = 5
+
+
+@dataclass(frozen=True)
+class Starter(Generic[Config]):
+    """A command or a launch file that begins runs and goes on with them."""
+
+    name: str
+    load: Callable[[str, dict[str, Any], Mapping[str, Any]], Config]
+    """(preset or YAML file, dotted settings, options) -> configuration."""
+    fixed: Mapping[str, Any]
+    """Options that decide the run, with their defaults."""
+    free: Mapping[str, Any]
+    """Options that are kept and may be given anew, with their defaults."""
+    names: Mapping[str, str]
+    """What the user calls settings, sections of them, and options that are not called by their own names."""
+    prefix: str = ""
+    """Stands before the others, e.g. --."""
+    joins: bool = False
+    """Whether it also goes on with a run that another one began."""
+
+    def called(self, name: str, *, option: bool = False) -> str:
+        """What the user calls a dotted setting, or an option."""
+        parts = name.split(".")
+        sections = (".".join(parts[:count]) for count in range(len(parts), 0, -1))
+        named = next((self.names[section] for section in sections if section in self.names), "")
+        return named or self.prefix + (name.replace("_", "-") if option and self.prefix else name)
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """What a run was begun with."""
+
+    settings: Mapping[str, Any]
+    """The resolved configuration, as in the file."""
+    preset: str = ""
+    """Name or file that the settings were made from; empty: none."""
+    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Fixed and free options of each starter, by its name."""
+
+    def with_device(self, device: str) -> "RunRecord":
+        return replace(self, settings={**self.settings, DEVICE: device})
+
+    def with_options(self, starter: Starter[Any], options: Mapping[str, Any]) -> "RunRecord":
+        kept = {name: value for name, value in options.items() if name in {**starter.fixed, **starter.free}}
+        return replace(self, options={**self.options, starter.name: kept})
+
+    def write(self, folder: Path) -> None:
+        """Write config.yaml where it is another one. Raises OSError."""
+        run = {
+            PRESET: self.preset, "settings_sha256": _sha256(self.settings),
+            "options": {name: dict(options) for name, options in self.options.items()},
+        }
+        data = str(yaml.safe_dump({**self.settings, RECORD: run}, sort_keys=False)).encode()
+        path = folder / CONFIG
+        if not path.is_file() or path.read_bytes() != data:
+            write_atomic(path, data)
+
+
+def read_record(folder: Path) -> RunRecord | None:
+    """The record in a run folder; None where there is none.
+
+    Raises:
+        ConfigError: a config.yaml that is damaged, changed since, or no record.
+    """
+    path = folder / CONFIG
+    if not path.exists():
+        return None
+    settings = read_yaml(path)
+    run = settings.pop(RECORD, None)
+    if not isinstance(run, dict) or {*run} != {PRESET, "settings_sha256", "options"}:
+        raise ConfigError(
+            f"{path} does not say how the run was begun (section {RECORD}); restore it, or begin another run folder "
+            "with this file as its preset"
+        )
+    if run["settings_sha256"] != _sha256(settings):
+        raise ConfigError(
+            f"{path} is not what the run was begun with (settings_sha256 differs); restore it, or begin another run "
+            "folder with this file as its preset"
+        )
+    return RunRecord(settings, run[PRESET], run["options"])
+
+
+def take_up(
+    folder: Path | None, starter: Starter[Config], given: Mapping[str, Any], settings: Mapping[str, Any], *,
+    compare: bool = True,
+) -> tuple[Config, dict[str, Any], RunRecord]:
+    """Begin a run, or go on with the one in `folder`; nothing is written.
+
+    Args:
+        given: the options that were given, `preset` among them.
+        settings: the dotted settings that were given.
+        compare: False: of an existing run only the configuration is taken; options are those given, or defaults.
+
+    Returns:
+        The configuration, all options, and the record to be written.
+
+    Raises:
+        ConfigError: the run was begun with other options or settings, which are named, or by another command.
+    """
+    record = read_record(folder) if folder else None
+    if folder is None or record is None:
+        options = {**starter.fixed, **starter.free, **given}
+        config = starter.load(options.get(PRESET, ""), dict(settings), options)
+        new = RunRecord(config.model_dump(), options.get(PRESET, ""))
+        return config, options, new.with_options(starter, options)
+    if not starter.joins and starter.name not in record.options:
+        raise ConfigError(
+            f"{folder} is a run of {' and '.join(map(repr, record.options))}, not of {starter.name!r}; name another "
+            "run folder"
+        )
+    before = {**starter.fixed, **starter.free, **(record.options.get(starter.name, given) if compare else given)}
+    before |= {PRESET: record.preset} if PRESET in starter.fixed else {}
+    options, saved = {**before, **given}, str(folder / CONFIG)
+    config = starter.load(saved, {}, options)
+    if not compare:
+        return config, options, record.with_options(starter, options)
+    other = starter.load(saved, dict(settings), options) if settings else config
+    differences = {
+        starter.called(name, option=True): (before[name], value)
+        for name, value in given.items() if name in starter.fixed and before[name] != value
+    }
+    run, now = dict(_leaves(config.model_dump())), dict(_leaves(other.model_dump()))
+    for name in {**run, **now}:
+        if run.get(name) != now.get(name) and name != DEVICE and any(_lies_in(name, part) for part in settings):
+            differences.setdefault(starter.called(name), (run.get(name), now.get(name)))
+    _refuse(folder, differences)
+    if DEVICE in settings:
+        config, record = config.with_values(device=other.device), record.with_device(other.device)
+    return config, options, record.with_options(starter, options)
+
+
+def keep_config(config: SettingsSection, folder: Path) -> None:
+    """Begin a run folder with a configuration; of one that is begun only the device changes."""
+    record, settings = read_record(folder), config.model_dump()
+    (RunRecord(settings) if record is None else record.with_device(settings[DEVICE])).write(folder)
+
+
+def _refuse(folder: Path, differences: Mapping[str, tuple[Any, Any]]) -> None:
+    if differences:
+        named = [f"{name} is {old!r} in this run, {new!r} is given" for name, (old, new) in differences.items()]
+        more = f"; and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
+        raise ConfigError(
+            f"{folder} was begun with other options: {'; '.join(named[:MOST_NAMED])}{more}. Leave them out to go on "
+            "with it, or begin another run folder"
+        )
+
+
+def _lies_in(name: str, section: str) -> bool:
+    return f"{name}.".startswith(f"{section}.")
+
+
+def _leaves(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{path}{key}.")
+        else:
+            yield f"{path}{key}", value
+
+
+def _sha256(settings: Mapping[str, Any]) -> str:
+    """Of all that a run's settings fix."""
+    fixed = {name: value for name, value in settings.items() if name != DEVICE}
+    return hashlib.sha256(str(yaml.safe_dump(fixed, sort_keys=False)).encode()).hexdigest()
