@@ -131,16 +131,16 @@ def run_verb(name: str, argv: Sequence[str], program: str) -> int:
     Raises:
         SystemExit: after --help, and where the verb has no such option.
     """
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal may lack a character; no reason to end
-    if (page := asked_page(name, argv, program)) is not None:
-        print(page, end="")
-        raise SystemExit(DONE)
-    if not sys.stderr.isatty():
-        os.environ.setdefault("TQDM_DISABLE", "1")  # bars of libraries; ours are lines then
     arguments = argparse.Namespace()
     try:
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="replace")  # a terminal may lack a character; no reason to end
+        if (page := asked_page(name, argv, program)) is not None:
+            print(page, end="")
+            raise SystemExit(DONE)
+        if not sys.stderr.isatty():
+            os.environ.setdefault("TQDM_DISABLE", "1")  # bars of libraries; ours are lines then
         arguments = parser_of(name, program).parse(argv)
         arguments.command = shlex.join([*program.split(), *argv])
         run: Callable[[argparse.Namespace], int | None] = arguments.run
