@@ -82,8 +82,8 @@ def make(request: pytest.FixtureRequest, models: dict[str, WorldModels]) -> Iter
     def build(seed: int) -> Environment:
         environment: Environment
         if name in OWN:
-            own = load_config("smoke", OWN[name])
-            environment = make_environment(own, own.environment.factory, num_envs=N, seed=seed)
+            settings = load_config("smoke", OWN[name])
+            environment = make_environment(settings, settings.environment.factory, num_envs=N, seed=seed)
         elif name == "maniskill":
             environment = make_simulator(config, seed)
         elif name == "imagined":

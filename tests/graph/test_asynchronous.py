@@ -15,6 +15,7 @@ from std_msgs.msg import Bool
 from wm_msgs.action import Rollout
 from wm_msgs.msg import ActionBatch, ErrorCode
 from wm_msgs.srv import StepBatch
+from wm_nodes.recording.messages import time_ns
 from wm_nodes.ros import calls, convert
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.wire import StepCommand
@@ -81,8 +82,8 @@ def test_the_policy_acts_on_images_in_real_time_and_says_hold_when_it_stops(grap
     policy = graph.start_policy(mode="asynchronous")
     wait_until("actions", lambda: len(actions) > 10)
     wait_until("steps with them", lambda: sum(not held(t) for t in transitions) > 10)
-    stamps = {convert.time_ns(t.next_stamp) for t in transitions}
-    assert sum(convert.time_ns(a.header.stamp) in stamps for a in actions) > 5
+    stamps = {time_ns(t.next_stamp) for t in transitions}
+    assert sum(time_ns(a.header.stamp) in stamps for a in actions) > 5
     moved = next(t for t in reversed(transitions) if not held(t))
     assert any(np.array_equal(moved.action, a.action) for a in actions)
     client = probe.action(Rollout, "rollout")
@@ -100,14 +101,14 @@ def test_stamps_are_wall_time_that_passes_as_the_environment_steps(graph: Graph,
     row, clock = topic("env/image"), probe.node.get_clock()
 
     def note(image: Image) -> None:
-        delays_s.append((clock.now().nanoseconds - convert.time_ns(image.header.stamp)) / 1e9)
+        delays_s.append((clock.now().nanoseconds - time_ns(image.header.stamp)) / 1e9)
 
     probe.node.create_subscription(row.type, row.name, note, row.qos)
     transitions = probe.listen("env/transition")
     graph.start_environment(num_envs=N, mode="asynchronous", control_period_s=period_s)
     wait_until("steps", lambda: len(transitions) > 40)
     steps = [t for t in transitions if t.header.stamp != t.next_stamp]
-    took_s = [(convert.time_ns(t.next_stamp) - convert.time_ns(t.header.stamp)) / 1e9 for t in steps]
+    took_s = [(time_ns(t.next_stamp) - time_ns(t.header.stamp)) / 1e9 for t in steps]
     assert min(took_s) > 0
     assert np.median(took_s) == pytest.approx(period_s, rel=0.2)
     assert 0 < min(delays_s) <= np.median(delays_s) < period_s

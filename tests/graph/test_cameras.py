@@ -18,7 +18,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from wm_nodes.nodes.environment.camera_topics import cameras_of
 from wm_nodes.recording import Bag
-from wm_nodes.ros import convert
+from wm_nodes.recording.messages import images_of, time_ns
 from wm_nodes.ros.wire import Reply
 
 pytestmark = pytest.mark.graph
@@ -66,19 +66,19 @@ def test_a_picture_and_its_calibration_have_one_stamp_and_one_frame(client: Clie
         """Pictures whose mosaic has come too."""
         nonlocal reply
         reply = move(client, reply)
-        whole.update({convert.time_ns(image.header.stamp): image for image in images})
-        return [picture for picture in pictures if convert.time_ns(picture.header.stamp) in whole]
+        whole.update({time_ns(image.header.stamp): image for image in images})
+        return [picture for picture in pictures if time_ns(picture.header.stamp) in whole]
 
     whole = dict[int, Image]()
     wait_until("pictures", lambda: len(seen()) > 3)
     found = seen()
     time.sleep(0.2)  # for the calibration of the last one
-    calibrated = {convert.time_ns(info.header.stamp) for info in infos}
+    calibrated = {time_ns(info.header.stamp) for info in infos}
     for picture in found:
-        assert convert.time_ns(picture.header.stamp) in calibrated
+        assert time_ns(picture.header.stamp) in calibrated
         assert picture.header.frame_id == first.header.frame_id == "wm_camera_hand_optical"
         assert (picture.width, picture.height, picture.step) == (SIDE_PX, SIDE_PX, 3 * SIDE_PX)
-        mosaic = convert.images_of(whole[convert.time_ns(picture.header.stamp)], client.spec)
+        mosaic = images_of(whole[time_ns(picture.header.stamp)], client.spec)
         pixels = np.frombuffer(picture.data, np.uint8).reshape(SIDE_PX, SIDE_PX, 3)
         np.testing.assert_array_equal(pixels, mosaic[SHOWN, :, SIDE_PX:])
     assert client.probe.node.count_subscribers("/wm/env/camera/top/image_raw") == 0
@@ -103,7 +103,7 @@ def test_a_still_camera_has_a_latched_frame_and_a_moving_one_that_of_each_observ
     wait_until("frames of several observations", moved)
     assert len(still) == 1
     for message in moving:
-        tool = replies[convert.time_ns(message.header.stamp)].states[SHOWN]
+        tool = replies[time_ns(message.header.stamp)].states[SHOWN]
         np.testing.assert_allclose(pose_of(message)[:3, 3], np.add(tool, (0, -0.1, 0.1)), atol=1e-6)
         np.testing.assert_allclose(pose_of(message)[:3, 2], np.array([0, 1, -1]) / 2**0.5, atol=1e-6)
 

@@ -12,6 +12,7 @@ from wm_msgs.msg import EpisodeEvent, ErrorCode
 from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
 from wm_nodes.core.errors import WireError
 from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.recording.messages import images_of
 from wm_nodes.ros import calls, convert
 from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand
 
@@ -65,7 +66,7 @@ def test_a_step_moves_the_state_by_the_scaled_action_and_publishes_image_and_tra
     step = convert.transition_of(transitions[1], client.spec)
     assert (step.stamp_ns, step.next_stamp_ns) == (before.stamp_ns, after.stamp_ns)
     np.testing.assert_array_equal(step.actions, actions)
-    np.testing.assert_array_equal(convert.images_of(images[1], client.spec), after.images)
+    np.testing.assert_array_equal(images_of(images[1], client.spec), after.images)
     assert step.valid.all()
     assert convert.transition_of(transitions[0], client.spec).is_reset
 

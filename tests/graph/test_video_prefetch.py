@@ -11,7 +11,7 @@ from graph.harness import Graph, Probe, own_domain, wait_until
 from graph.video_loop import VideoLoop, settings
 
 from wm_msgs.action import GenerateClips, TrainVideo
-from wm_nodes.ros.convert import time_ns
+from wm_nodes.recording.messages import time_ns
 from wm_nodes.training.metrics import read_metrics
 from wm_nodes.training.weights import unpack_weights
 

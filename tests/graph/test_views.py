@@ -10,7 +10,7 @@ from rcl_interfaces.srv import SetParameters
 from sensor_msgs.msg import Image
 
 from wm_msgs.srv import GetEnvSpec
-from wm_nodes.ros import convert
+from wm_nodes.recording.messages import images_of
 from wm_nodes.ros.lifecycle import SERVICE_EVENTS
 from wm_nodes.ros.qos import VIEW
 
@@ -45,7 +45,7 @@ def test_the_compressed_image_is_the_mosaic_and_is_made_only_while_someone_looks
     whole = next(m for m in images if m.header.stamp == alone.header.stamp)
     np.testing.assert_array_equal(
         np.frombuffer(alone.data, np.uint8).reshape(alone.height, alone.width, 3),
-        convert.images_of(whole, client.spec)[2],
+        images_of(whole, client.spec)[2],
     )
 
 

@@ -74,6 +74,7 @@ def test_given_arguments_that_differ_are_named_and_nothing_is_touched(tmp_path: 
         ({"judge": "http://b/v1"}, "judge is ['http://a/v1'] in this run, ['http://b/v1'] is given"),
         ({"judge_model": "other"}, "judge_model is 'judge' in this run, 'other' is given"),
         ({"reward": "rule"}, "reward is 'agent' in this run, 'rule' is given"),
+        ({"learner.factory": "mine:learner"}, "learner.factory is '' in this run, 'mine:learner' is given"),
         ({"learner_ranks": "2"}, "learner_ranks is '1' in this run, '2' is given"),
     ):
         assert part in refused("online_training", {**run_in(tmp_path), **given})

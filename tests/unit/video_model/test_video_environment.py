@@ -12,7 +12,6 @@ from video_toys import rollout_config
 from wm_nodes.config.load import load_config
 from wm_nodes.core.seeding import stream_seed
 from wm_nodes.core.specs import SOURCE_IMAGINED, EnvironmentSpec
-from wm_nodes.core.tool_control import next_state
 from wm_nodes.core.types import FloatArray, StepResult, UInt8Array
 from wm_nodes.video_model import NetworkSettings, VideoNetwork, initial_noise
 from wm_nodes.video_model.codec import PatchCodec
@@ -157,25 +156,6 @@ def test_actions_steer_and_only_their_own_environment() -> None:
     assert (first != second).any((1, 2, 3)).tolist() == [False, True, False]
 
 
-def test_the_tool_position_follows_the_controller_exactly() -> None:
-    env = make()
-    before = env.reset().state
-    np.testing.assert_array_equal(
-        env.step(actions(0)).observation.state, next_state(before, actions(0), env.spec)
-    )
-
-
-def test_an_episode_is_truncated_at_the_step_limit_and_then_stays_put() -> None:
-    env = make()
-    env.reset()
-    results = [env.step(actions(step)) for step in range(env.spec.max_episode_steps + 1)]
-    assert not np.concatenate([result.truncated for result in results[:-2]]).any()
-    assert results[-2].truncated.all() and not results[-2].terminated.any()
-    assert not results[-1].valid.any()
-    np.testing.assert_array_equal(results[-1].observation.image, results[-2].observation.image)
-    np.testing.assert_array_equal(results[-1].observation.episode_step, [env.spec.max_episode_steps] * NUM_ENVS)
-
-
 def test_the_reader_of_the_new_frame_ends_an_episode_and_the_others_go_on() -> None:
     reader = Reader()
     env = make(reader=reader)
@@ -190,23 +170,6 @@ def test_the_reader_of_the_new_frame_ends_an_episode_and_the_others_go_on() -> N
     result = env.step(actions(1))
     np.testing.assert_array_equal(result.valid, ~ended)
     np.testing.assert_array_equal(result.uncertainty, np.zeros(NUM_ENVS))
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        (np.zeros((NUM_ENVS, 2), np.float32), "shape"),
-        (np.full((NUM_ENVS, 3), np.nan, np.float32), "finite"),
-        (np.full((NUM_ENVS, 3), 1.5, np.float32), r"\[-1, 1\]"),
-    ],
-)
-def test_bad_actions_are_refused_and_change_nothing(wrong: FloatArray, message: str) -> None:
-    env, untouched = make(), make()
-    env.reset()
-    untouched.reset()
-    with pytest.raises(ValueError, match=message):
-        env.step(wrong)
-    assert_same(env.step(actions(0)), untouched.step(actions(0)))
 
 
 def test_damaged_weights_are_an_error_and_leave_the_episode_where_it_was() -> None:

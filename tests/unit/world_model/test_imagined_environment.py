@@ -204,23 +204,6 @@ def test_too_much_disagreement_of_the_done_heads_truncates(models: WorldModels) 
     assert env.step(actions(0)).truncated.all()
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        (np.zeros((NUM_ENVS, 2), np.float32), "shape"),
-        (np.full((NUM_ENVS, 3), np.nan, np.float32), "finite"),
-        (np.full((NUM_ENVS, 3), 1.5, np.float32), r"\[-1, 1\]"),
-    ],
-)
-def test_bad_actions_are_refused_and_change_nothing(models: WorldModels, wrong: FloatArray, message: str) -> None:
-    env, untouched = make(models), make(models)
-    env.reset()
-    untouched.reset()
-    with pytest.raises(ValueError, match=message):
-        env.step(wrong)
-    assert_same(env.step(actions(0)), untouched.step(actions(0)))
-
-
 def test_the_spec_says_imagined_and_names_the_model(models: WorldModels) -> None:
     spec = make(models).spec
     assert spec.source == SOURCE_IMAGINED

@@ -38,14 +38,14 @@ def find_files(kind: str, folder: str, variable: str) -> dict[str, str]:
 def _modules(name: str, variable: str) -> list[tuple[str, str]]:
     """Package and name of each file that a package holds, or of the one that the name says; none is imported."""
     try:
-        found = importlib.util.find_spec(name)
+        place = importlib.util.find_spec(name)
     except ModuleNotFoundError:
-        found = None
-    if found is None:
+        place = None
+    if place is None:
         raise ValueError(f"{variable} names {name!r}, no package or module that Python finds; see PYTHONPATH")
-    if found.submodule_search_locations is None:
+    if place.submodule_search_locations is None:
         return [(name.rpartition(".")[0], name.rpartition(".")[2])]
-    modules = pkgutil.iter_modules(found.submodule_search_locations)
+    modules = pkgutil.iter_modules(place.submodule_search_locations)
     return [(name, module.name) for module in modules if not module.name.startswith("_")]
 
 
@@ -60,10 +60,10 @@ def load_file(name: str, packages: dict[str, str], kind: type[T], guide: str) ->
         ValueError: the file has no such constant.
     """
     module = importlib.import_module(".".join(filter(None, (packages[name], name))))
-    found = getattr(module, kind.__name__.upper(), None)
-    if not isinstance(found, kind):
+    place = getattr(module, kind.__name__.upper(), None)
+    if not isinstance(place, kind):
         raise ValueError(f"{module.__file__} has no {kind.__name__.upper()} = {kind.__name__}(...); see {guide}")
-    return found
+    return place
 
 
 def _shipped(folder: str) -> list[str]:

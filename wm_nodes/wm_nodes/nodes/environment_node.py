@@ -279,19 +279,19 @@ class EnvironmentNode(ManagedNode):
             self.diagnostics.count("waits_for_credit", level=diagnostics.OK)
             raise WireError(ErrorCode.BUSY, f"waiting for {', '.join(blocking)} to take in seq {next_seq - 1}; retry")
 
-    def _refusal(self, response: Any, error: WireError, what: str) -> Any:
-        self._count_refusal(error, what)
+    def _refusal(self, response: Any, error: WireError, kind: str) -> Any:
+        self._count_refusal(error, kind)
         return convert.fill_error(response, error)
 
-    def _count_refusal(self, error: WireError, what: str) -> None:
+    def _count_refusal(self, error: WireError, kind: str) -> None:
         if error.code != ErrorCode.BUSY:
             bad_numbers = error.code in (ErrorCode.NAN_INPUT, ErrorCode.NAN_MODEL)
             level = diagnostics.ERROR if bad_numbers or error.code == ErrorCode.INTERNAL else diagnostics.WARN
-            self.diagnostics.count(f"refused_{what}", level=level, text=f"{what} refused: {error}")
+            self.diagnostics.count(f"refused_{kind}", level=level, text=f"{kind} refused: {error}")
             if bad_numbers:
                 self.diagnostics.count("nan", level=level, text=str(error))
             trace = "".join(traceback.format_exception(error.__cause__)) if error.__cause__ is not None else ""
-            self.get_logger().error(f"{what} refused: {error}\n{trace}".rstrip(), throttle_duration_sec=1.0)
+            self.get_logger().error(f"{kind} refused: {error}\n{trace}".rstrip(), throttle_duration_sec=1.0)
 
 
 def mosaic_bytes(spec: EnvironmentSpec) -> int:

@@ -97,8 +97,8 @@ def make_policy(config: RunConfig, model_dir: Path | None) -> ImagePolicy:
         ValueError: neither a factory nor a model.
     """
     if config.policy.factory:
-        own: ImagePolicy = load_factory(config.policy.factory)(config)
-        return own.to(compute_device(config.device))
+        made: ImagePolicy = load_factory(config.policy.factory)(config)
+        return made.to(compute_device(config.device))
     if model_dir is None:
         raise ValueError(f"a policy sees by a world model's tokenizer; name a model's folder, or policy.factory, e.g. "
                          f"{UNTRAINED}")
@@ -131,8 +131,8 @@ def make_reward(config: RunConfig, model_dir: Path | None) -> RewardModel:
     """Return what a step is worth: the reward of reward.factory, else the endogenous one of the world model, or without
     a model the environment's own success. Raises as make_endogenous_reward."""
     if config.reward.factory:
-        own: RewardModel = load_factory(config.reward.factory)(config)
-        return own
+        reward: RewardModel = load_factory(config.reward.factory)(config)
+        return reward
     return RuleReward(config.reward.sparse_weight) if model_dir is None else make_endogenous_reward(config, model_dir)
 
 
@@ -140,8 +140,8 @@ def make_learner(policy: ImagePolicy, config: RunConfig, ranks: Ranks | None = N
     """Return the algorithm that trains `policy` in place: that of learner.factory, else PPO, to which the present
     weights are the reference that the policy stays close to."""
     if config.learner.factory:
-        own: Learner = load_factory(config.learner.factory)(policy, config)
-        return own
+        learner: Learner = load_factory(config.learner.factory)(policy, config)
+        return learner
     return PpoLearner(policy, config.ppo, seed=config.seed, ranks=ranks)
 
 

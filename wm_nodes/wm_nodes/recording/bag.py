@@ -220,10 +220,10 @@ def _information(path: Path) -> Mapping[str, Any]:
     """What metadata.yaml of a bag folder says; empty for one file of a bag."""
     if not path.is_dir():
         return {}
-    found = read_yaml(path / METADATA).get("rosbag2_bagfile_information")
-    if not isinstance(found, Mapping):
+    information = read_yaml(path / METADATA).get("rosbag2_bagfile_information")
+    if not isinstance(information, Mapping):
         raise ValueError(f"{path / METADATA} has no rosbag2_bagfile_information")
-    return found
+    return information
 
 
 def _files(path: Path, information: Mapping[str, Any]) -> list[Path]:
@@ -239,7 +239,7 @@ def _files(path: Path, information: Mapping[str, Any]) -> list[Path]:
 
 def _connections(information: Mapping[str, Any], files: Sequence[storage.BagFile]) -> list[Connection]:
     """The topics of a bag: named as in metadata.yaml and its files, with the messages that the files hold."""
-    found: dict[tuple[str, str], Connection] = {}
+    connections: dict[tuple[str, str], Connection] = {}
     rows = [row["topic_metadata"] for row in information.get("topics_with_message_count") or ()]
     announced = (
         Connection(
@@ -250,15 +250,15 @@ def _connections(information: Mapping[str, Any], files: Sequence[storage.BagFile
         for row in rows
     )
     for connection in chain(announced, *(file.connections for file in files)):
-        known = found.setdefault((connection.topic, connection.msgtype), connection)
+        known = connections.setdefault((connection.topic, connection.msgtype), connection)
         if known is not connection:
             assert isinstance(known.ext, ConnectionExtRosbag2)
-            found[connection.topic, connection.msgtype] = known._replace(
+            connections[connection.topic, connection.msgtype] = known._replace(
                 msgcount=known.msgcount + connection.msgcount, digest=known.digest or connection.digest,
                 msgdef=connection.msgdef if known.msgdef.format is MessageDefinitionFormat.NONE else known.msgdef,
                 ext=known.ext if known.ext.offered_qos_profiles else connection.ext,
             )
-    return list(found.values())
+    return list(connections.values())
 
 
 def _falls(sequenced: Iterator[bytes]) -> int:

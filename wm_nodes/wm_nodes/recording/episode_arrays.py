@@ -62,8 +62,9 @@ class EpisodeArrays:
     @property
     def labelled(self) -> BoolArray:
         """(E, J), True where the episode shows whether the task is done, see config.tasks.shares_scene."""
-        known = {(own, task): shares_scene(own, task) for own in set(self.recorded_tasks) for task in self.tasks}
-        return np.array([[known[own, task] for task in self.tasks] for own in self.recorded_tasks])
+        recorded_tasks = set(self.recorded_tasks)
+        known = {(recorded, task): shares_scene(recorded, task) for recorded in recorded_tasks for task in self.tasks}
+        return np.array([[known[recorded, task] for task in self.tasks] for recorded in self.recorded_tasks])
 
     def select(self, rows: Sequence[int] | NDArray[Any]) -> "EpisodeArrays":
         index = np.asarray(rows, np.int64)

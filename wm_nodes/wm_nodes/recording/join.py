@@ -131,7 +131,7 @@ class Joiner:
         if blank is None:
             return None
         images = np.stack([blank if image is None else image for image, _ in goals])
-        return images, np.array([image is not None and found for image, found in goals])
+        return images, np.array([image is not None and known for image, known in goals])
 
 
 class LockSteps:

@@ -145,9 +145,9 @@ def lockstep_of(message: Any, spec: EnvironmentSpec) -> LockStep:
     }
     fields = {name: getattr(message, name) for name in LOCKSTEP_ARRAYS} | {"ground_truth": truth}
     arrays: dict[str, Any] = {
-        own: flags(fields[name], count, name) if dtype is np.bool_
+        attribute: flags(fields[name], count, name) if dtype is np.bool_
         else array_of(fields[name], dtype, widths.get(name, (count,)), name)
-        for name, (own, dtype) in LOCKSTEP_ARRAYS.items()
+        for name, (attribute, dtype) in LOCKSTEP_ARRAYS.items()
     }
     return LockStep(
         session=int(message.session), step_id=int(message.step_id), stamp_ns=time_ns(message.header.stamp),
@@ -157,7 +157,7 @@ def lockstep_of(message: Any, spec: EnvironmentSpec) -> LockStep:
 
 def lockstep_arrays(step: LockStep) -> dict[str, NDArray[Any]]:
     """The array fields of wm_msgs/TransitionBatch, in our shapes."""
-    return {name: getattr(step, own) for name, (own, _) in LOCKSTEP_ARRAYS.items()}
+    return {name: getattr(step, attribute) for name, (attribute, _) in LOCKSTEP_ARRAYS.items()}
 
 
 def lockstep_message(step: LockStep, seq: int) -> Any:

@@ -53,8 +53,8 @@ def recover(path: Path, *, output: Path | None = None) -> RecoverReport:
         BagError: nothing to read at `path`, no complete message in it, or `output` exists.
     """
     path = Path(path)
-    found = (file for file in path.iterdir() if file.name.endswith(storage.SUFFIXES)) if path.is_dir() else (path,)
-    files = sorted(found, key=_file_number)
+    listed = (file for file in path.iterdir() if file.name.endswith(storage.SUFFIXES)) if path.is_dir() else (path,)
+    files = sorted(listed, key=_file_number)
     if not files or not files[0].is_file():
         raise BagError(f"no .mcap file at {path}, nor a .db3 file; give the .partial folder, a bag folder or a file")
     target = output if output is not None else _default_output(path)

@@ -113,8 +113,8 @@ class McapFile:
             entries = list[tuple[int, int]]()
             for offset in (at for channel, at in index.message_index_offsets.items() if channel in ids):
                 self._stream.seek(offset + _RECORD_HEADER_BYTES)
-                found = MessageIndex.read(ReadDataStream(self._stream))
-                entries += [(place, time_ns) for time_ns, place in found.records]
+                index_record = MessageIndex.read(ReadDataStream(self._stream))
+                entries += [(place, time_ns) for time_ns, place in index_record.records]
             times += [time_ns for _, time_ns in sorted(entries)]
         return times
 

@@ -58,13 +58,13 @@ def _wait(done: threading.Event, timeout_s: float, check: Check, text: str) -> N
             raise PeerLost(text)
 
 
-def wait_until(ready: Callable[[], bool], timeout_s: float, check: Check, what: str) -> None:
+def wait_until(ready: Callable[[], bool], timeout_s: float, check: Check, name: str) -> None:
     """Poll `ready` in a worker thread. Raises PeerLost after timeout_s."""
     deadline = time.monotonic() + timeout_s
     while not ready():
         check()
         if time.monotonic() >= deadline:
-            raise PeerLost(f"{what} is not there after {timeout_s:g} s; is its node running and active?")
+            raise PeerLost(f"{name} is not there after {timeout_s:g} s; is its node running and active?")
         time.sleep(POLL_S / 2)
 
 

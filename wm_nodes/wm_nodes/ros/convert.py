@@ -215,6 +215,6 @@ def rewards_of(message: RewardBatch) -> Rewards:
     return rewards
 
 
-def _check_finite(values: FloatArray, name: str, what: str) -> None:
+def _check_finite(values: FloatArray, name: str, kind: str) -> None:
     if not np.isfinite(values).all():
-        raise WireError(ErrorCode.NAN_INPUT, f"{name} of a valid {what} is NaN or infinite; set valid to 0")
+        raise WireError(ErrorCode.NAN_INPUT, f"{name} of a valid {kind} is NaN or infinite; set valid to 0")

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 from rclpy.node import Node
 
@@ -20,9 +20,6 @@ from wm_nodes.ros.guard import check_sender, nodes_of
 from wm_nodes.ros.publishing import StampedPublisher
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.worker import Work
-
-if TYPE_CHECKING:
-    from wm_nodes.ros.lifecycle import ManagedNode
 
 Ends = Callable[[str], set[str]]
 """Topic name to the nodes (fully qualified) whose end of it is known."""
@@ -108,18 +105,18 @@ class EndpointTable:
                 and all(name in writers(topic) for topic in incoming & peer.publishes)
             ):
                 linked.add(key)
-        own = _Peer(self._session, active, outgoing, incoming, frozenset(linked))
-        changed = own != self._own
+        mine = _Peer(self._session, active, outgoing, incoming, frozenset(linked))
+        changed = mine != self._own
         with self._lock:
-            self._own = own
+            self._own = mine
         return changed
 
     def announcement(self) -> NodeLinks:
         """What this node knows of itself since the last refresh()."""
-        own, names = self._own, sorted(self._own.linked)
+        mine, names = self._own, sorted(self._own.linked)
         return NodeLinks(
-            session=self._session, node=self._own_name, active=own.active, publishes=sorted(own.publishes),
-            subscribes=sorted(own.subscribes), linked=[name for name, _ in names],
+            session=self._session, node=self._own_name, active=mine.active, publishes=sorted(mine.publishes),
+            subscribes=sorted(mine.subscribes), linked=[name for name, _ in names],
             linked_sessions=[session for _, session in names],
         )
 
@@ -183,11 +180,11 @@ class StartBarrier:
     """Holds a data flow back until no node of the graph can miss its first messages; once for each lack.
 
     Args:
-        node: has the parameters await_nodes and match_timeout_s.
+        node: a ManagedNode with the parameters await_nodes and match_timeout_s.
         table: what this node knows about the links of all nodes.
     """
 
-    def __init__(self, node: "ManagedNode", table: EndpointTable) -> None:
+    def __init__(self, node: Any, table: EndpointTable) -> None:
         self._node, self._table = node, table
         self._given_up: set[str] = set()
 

@@ -96,8 +96,8 @@ class Guard:
     def _publishers_of(self, topic: str) -> str:
         """Who may have sent a message of a topic: DDS hands rclpy's callbacks no sender."""
         ends = self._node.get_publishers_info_by_topic(topic)
-        own = self._node.get_fully_qualified_name()
-        return " or ".join(sorted(nodes_of(ends) - {own})) or (own if ends else "a publisher that is gone")
+        this_node = self._node.get_fully_qualified_name()
+        return " or ".join(sorted(nodes_of(ends) - {this_node})) or (this_node if ends else "a publisher that is gone")
 
     def _bounded(self, publisher: str) -> str:
         if publisher not in self._publishers and len(self._publishers) >= MAX_KINDS:

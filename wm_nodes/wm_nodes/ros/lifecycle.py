@@ -306,21 +306,21 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self._release()
         return TransitionCallbackReturn.SUCCESS
 
-    def _attempt(self, what: str, work: Callable[[], None]) -> TransitionCallbackReturn:
+    def _attempt(self, action: str, work: Callable[[], None]) -> TransitionCallbackReturn:
         try:
             work()
         except REFUSALS as error:
-            return self._refuse(what, error, TransitionCallbackReturn.FAILURE)
+            return self._refuse(action, error, TransitionCallbackReturn.FAILURE)
         except Exception as error:
             self.get_logger().error(traceback.format_exc())
-            return self._refuse(what, error, TransitionCallbackReturn.ERROR)
+            return self._refuse(action, error, TransitionCallbackReturn.ERROR)
         self.diagnostics.clear_condition("lifecycle")
         return TransitionCallbackReturn.SUCCESS
 
-    def _refuse(self, what: str, error: Exception, result: TransitionCallbackReturn) -> TransitionCallbackReturn:
+    def _refuse(self, action: str, error: Exception, result: TransitionCallbackReturn) -> TransitionCallbackReturn:
         text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
-        self.get_logger().error(f"{what} failed: {text or type(error).__name__}")
-        self.diagnostics.set_condition("lifecycle", diagnostics.ERROR, f"{what} failed: {text}")
+        self.get_logger().error(f"{action} failed: {text or type(error).__name__}")
+        self.diagnostics.set_condition("lifecycle", diagnostics.ERROR, f"{action} failed: {text}")
         return result
 
     def _release(self) -> None:

@@ -59,11 +59,11 @@ class ImageViews:
         if wanted and self._due("compressed"):
             self._compressed.publish(jpeg_msg(mosaic, int(self._param("compressed_quality"))))
 
-    def _due(self, what: str) -> bool:
+    def _due(self, view: str) -> bool:
         now = time.monotonic()
-        due = now - self._last_s.get(what, -1e9) >= float(self._param(f"{what}_period_s"))
+        due = now - self._last_s.get(view, -1e9) >= float(self._param(f"{view}_period_s"))
         if due:
-            self._last_s[what] = now
+            self._last_s[view] = now
         return due
 
     def _param(self, name: str) -> Any:

@@ -229,15 +229,15 @@ def report_when_made(
         config = config.model_copy(update={"task": task})
     metrics = held.get(task, held)
     if f"tool_ratio_h{steps:02d}" not in metrics and (spec.get("ground_truth_names", True) or not metrics):
-        criteria, notes = _policy_criteria(config, imagined, real, None)
+        of_policy, left_out = _policy_criteria(config, imagined, real, None)
         note = f"the model's manifest holds no metrics of held-out episodes of {task}"
-        return AcceptanceReport(task, 0, tuple(criteria), {}, (note, *notes))
-    found, told = apply_criteria(metrics, config, steps, imagined, real)
+        return AcceptanceReport(task, 0, tuple(of_policy), {}, (note, *left_out))
+    criteria, notes = apply_criteria(metrics, config, steps, imagined, real)
     if manifest.get("success_threshold") != config.reward.success_threshold:
-        found = tuple(row for row in found if not row.name.startswith("done"))
+        criteria = tuple(row for row in criteria if not row.name.startswith("done"))
         at = f"reward.success_threshold {config.reward.success_threshold:g}"
-        told = (f"The done signal at {at} was not judged.", *told)
-    return AcceptanceReport(task, int(metrics.get("episodes") or 0), found, {}, told)
+        notes = (f"The done signal at {at} was not judged.", *notes)
+    return AcceptanceReport(task, int(metrics.get("episodes") or 0), criteria, {}, notes)
 
 
 def accepted_when_made(manifest: Mapping[str, Any], config: RunConfig) -> str:
