@@ -177,7 +177,8 @@ def test_train_policy_without_a_task_names_what_is_missing(
         ([], "task is empty; name a model of your recordings with --model-dir"),
         (["--model-dir", str(model_dir)], "task is empty; name recordings of demonstrations with --demos"),
         (["--model-dir", str(model_dir), "--demos", str(bag)], "task is empty, and environment maniskill simulates"),
-        (["--model-dir", str(model_dir), "--demos", str(bag), "--model_refresh.num_rounds", "2", "--evaluation.environment", "none"],
+        (["--model-dir", str(model_dir), "--demos", str(bag), "--model_refresh.num_rounds", "2",
+          "--evaluation.environment", "none"],
          "model_refresh.num_rounds is 2, and rounds collect in the simulator"),
     ):
         assert main([*begun, *given]) == 2
