@@ -28,6 +28,7 @@ OPTIONS = {
     "--namespace --reads --audit",
     "retrain": "run --run-dir --SECTION.KEY --tensorboard",
     "recover-bag": "bag --output",
+    "import rosbag": "contract bags --out",
     "judge-clips": "clips --config --device --judge --judge-model --judge-key-env --rubric --mode --audit --reads "
     "--json",
     "judge check": "judge --model --key-env --rubric --limit --reads --SECTION.KEY --device --json",

@@ -47,6 +47,7 @@ GROUPS = {
         "rescore": "score a recording again, compare bit for bit",
         "retrain": "train a video model again on a run's recorded clips and scores",
         "recover-bag": "bring back a recording whose process was killed",
+        "import rosbag": "plain ROS bags of your robot into one of ours, by a contract",
     },
     "judge": {
         "judge serve-help": "which open model for which memory, and how it is served",
@@ -163,7 +164,7 @@ def parser_of(name: str, program: str) -> Parser:
     with leaving_when_interrupted():
         verb: Any = (
             import_module(f"{BENCHMARKS}.experiment").find_experiment(experiment) if group == "benchmark"
-            else import_module(f"wm_nodes.apps.{name.replace('-', '_').replace(' ', '.')}")
+            else import_module(module_of(name))
         )
     parser = Parser(
         prog=program, description=inspect.cleandoc(verb.__doc__), epilog=EXIT_CODES,
@@ -174,10 +175,14 @@ def parser_of(name: str, program: str) -> Parser:
     return parser
 
 
+def module_of(verb: str) -> str:
+    """The module of a verb; of `import rosbag` import_rosbag, as no package can be called import."""
+    return f"wm_nodes.apps.{verb.replace('import ', 'import_').replace('-', '_').replace(' ', '.')}"
+
+
 def refuse_module(name: str) -> NoReturn:
     """End the process, as `python -m` with the module of a verb would do nothing."""
-    verb = name.removeprefix("wm_nodes.apps.").replace("_", "-").replace(".", " ")
-    typed = f"wm {verb}" if verb in VERBS else "wm --help"
+    typed = next((f"wm {verb}" for verb in VERBS if module_of(verb) == name), "wm --help")
     raise SystemExit(_fail(f"{name} is not started by itself; type: {typed}"))
 
 

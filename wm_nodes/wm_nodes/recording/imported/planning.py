@@ -1,0 +1,298 @@
+"""The episodes of one bag, before a picture is decoded: where they begin and end, what was seen and commanded at each
+tick. Shapes: K ticks of a span, T steps of an episode, S state, A action, V cameras.
+
+A span is what the contract's split cuts out, from its first command to its last; its ticks are one period apart.
+Observation k is the newest sample of each topic at or before tick k, action k what was commanded in [k, k + 1). Where
+one of them is missing, the span is cut: nothing is filled.
+"""
+
+import csv
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wm_nodes.core.types import BoolArray, FloatArray
+from wm_nodes.recording.errors import BagError
+from wm_nodes.recording.imported.contract import BOOL, Commands, Contract, InstructionTopic
+from wm_nodes.recording.imported.streams import Stream, Times
+from wm_nodes.recording.messages import NS_PER_S
+
+NEVER_NS = 2**63 - 1
+LABEL_COLUMNS = ("bag", "start_s", "end_s", "success")
+
+
+@dataclass(frozen=True)
+class Span:
+    """An episode as it was recorded."""
+
+    start_ns: int
+    """Of its first tick."""
+    end_ns: int
+    """Of its last tick, at most."""
+    until_ns: int
+    """When the next one begins; what is said of its success before counts."""
+
+
+@dataclass(frozen=True)
+class PlannedEpisode:
+    """An episode of ours, without its pictures."""
+
+    ticks: Times
+    """(T + 1,), ns on the contract's clock."""
+    pictures: NDArray[np.int64]
+    """(T + 1, V), of each camera the place among the messages of its topic."""
+    states: FloatArray
+    """(T + 1, S)."""
+    actions: FloatArray
+    """(T, A), in [-1, 1]."""
+    success: BoolArray
+    """(T + 1,)."""
+    rewards: FloatArray
+    """(T,), NaN where none is recorded."""
+    instruction: str
+    """What was asked for."""
+
+
+@dataclass
+class Tally:
+    """What planning counted."""
+
+    ticks: int = 0
+    """Of all spans."""
+    missing: Counter[str] = field(default_factory=Counter)
+    """Ticks without a sample, by place in the contract."""
+    lost: Counter[str] = field(default_factory=Counter)
+    """Ticks of no episode, by reason."""
+    lost_episodes: Counter[str] = field(default_factory=Counter)
+    """Stretches and spans that became no episode, by reason."""
+    gaps: dict[str, tuple[float, str]] = field(default_factory=dict)
+    """Largest distance of two samples within a span, s, and where, by place."""
+    commanded: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Least and largest command, by the action's name."""
+    beyond: Counter[str] = field(default_factory=Counter)
+    """Steps with a command beyond the limits, by the action's name."""
+    steps: int = 0
+    """Of all episodes."""
+    unlabelled: int = 0
+    """Spans of whose success nothing was said: failures."""
+
+
+def spans_of(streams: Mapping[str, Stream], contract: Contract) -> list[Span]:
+    """Where the episodes of a bag lie."""
+    split = contract.episodes.split
+    commands = np.sort(np.concatenate([s.times for place, s in streams.items() if place.startswith("actions")]))
+    if split.per:
+        used = [stream for place, stream in streams.items() if place.startswith(("images", "state", "actions"))]
+        bounds = [(min(int(s.times[0]) for s in used), max(int(s.times[-1]) for s in used))]
+    elif split.gap_s:
+        cuts = np.flatnonzero(np.diff(commands) > split.gap_s * NS_PER_S)
+        starts, ends = [0, *(cuts + 1)], [*cuts, len(commands) - 1]
+        bounds = [(int(commands[a]), int(commands[b]) + contract.period_ns) for a, b in zip(starts, ends)]
+    else:
+        says = streams["split"]
+        bounds, begun = [], NEVER_NS
+        for time_ns, running in zip(says.times.tolist(), says.values[:, 0] > 0):
+            if running and begun == NEVER_NS:
+                begun = time_ns
+            elif not running and begun < NEVER_NS:
+                bounds.append((begun, time_ns))
+                begun = NEVER_NS
+        if begun < NEVER_NS:
+            bounds.append((begun, int(commands[-1]) + contract.period_ns))
+    nexts = [start for start, _ in bounds[1:]] + [NEVER_NS]
+    return [Span(start, end, until) for (start, end), until in zip(bounds, nexts)]
+
+
+class Planner:
+    """Plans the episodes of one bag.
+
+    Args:
+        name: of the bag, for labels and errors.
+        begun_ns: receive time of its first message.
+    """
+
+    def __init__(
+        self, name: str, begun_ns: int, streams: Mapping[str, Stream], contract: Contract, tally: Tally
+    ) -> None:
+        self.name, self.begun_ns, self.streams, self.contract, self.tally = name, begun_ns, streams, contract, tally
+        self._images, self._state, self._actions = (
+            [stream for place, stream in streams.items() if place.startswith(kind)]
+            for kind in ("images", "state", "actions")
+        )
+        labels = contract.episodes.success.file
+        self._labels = _labels_of(labels, name) if labels else ()
+
+    def episodes(self) -> list[PlannedEpisode]:
+        """Raises BagError: a span without a label."""
+        return [episode for span in spans_of(self.streams, self.contract) for episode in self._of_span(span)]
+
+    def _of_span(self, span: Span) -> list[PlannedEpisode]:
+        contract, tally = self.contract, self.tally
+        ticks = np.arange(span.start_ns, span.end_ns + 1, contract.period_ns, dtype=np.int64)
+        commands, commanded = self._commands(ticks)
+        moved = np.flatnonzero(commanded)
+        if not len(moved):
+            tally.lost_episodes["without a command"] += 1
+            return []
+        first, end = moved[0], min(moved[-1] + 2, len(ticks))
+        ticks, commands, commanded = ticks[first:end], commands[first:end], commanded[first:end]
+        instruction = self._instruction(span)
+        if instruction is None:
+            tally.lost_episodes["without an instruction"] += 1
+            return []
+        seen = self._seen(ticks, commanded, span)
+        joined = seen[:-1] & seen[1:] & commanded[:-1]
+        success = self._success(ticks, span)
+        pictures = np.stack([stream.numbers[stream.newest(ticks)] for stream in self._images], 1)
+        states = np.concatenate(
+            [np.zeros((len(ticks), 0)), *(stream.values[stream.newest(ticks)] for stream in self._state)], 1
+        )
+        commands = self._relative(commands, states)
+        actions = self._scaled(commands)
+        planned, covered = list[PlannedEpisode](), 0
+        for start, steps in _stretches(joined):
+            if steps < contract.episodes.min_steps:
+                tally.lost_episodes[f"shorter than min_steps {contract.episodes.min_steps}"] += 1
+                continue
+            covered += steps
+            for part in np.array_split(np.arange(start, start + steps), -(-steps // contract.episodes.max_steps)):
+                rows, frames = slice(part[0], part[-1] + 1), slice(part[0], part[-1] + 2)
+                self._count_commands(actions[rows], commands[rows])
+                planned.append(PlannedEpisode(
+                    ticks[frames], pictures[frames], states[frames].astype(np.float32),
+                    np.clip(actions[rows], -1, 1).astype(np.float32), success[frames], self._rewards(ticks[frames][1:]),
+                    instruction,
+                ))
+        tally.lost["in or beside a gap"] += len(joined) - covered
+        return planned
+
+    def _seen(self, ticks: Times, commanded: BoolArray, span: Span) -> BoolArray:
+        """(K,) whether every observed topic has a sample that is new enough; counts ticks without one, and gaps."""
+        seen = np.ones(len(ticks), bool)
+        self.tally.ticks += len(ticks)
+        for stream in (*self._images, *self._state, *self._actions):
+            place, has = stream.place, self._is_fresh(stream, ticks)
+            if isinstance(stream.source, Commands):
+                has = self._command(stream, ticks)[1]
+                has[-1] = True  # nothing is commanded after the last frame
+            else:
+                seen &= has
+            self.tally.missing[place] += int((~has).sum())
+            inside = stream.times[(stream.times > ticks[0]) & (stream.times < ticks[-1])]
+            times = np.concatenate([ticks[:1], inside, ticks[-1:]])
+            largest = int(np.diff(times).argmax())
+            gap_s = float(np.diff(times)[largest]) / NS_PER_S
+            if gap_s > self.tally.gaps.get(place, (0.0, ""))[0]:
+                begins_s = (times[largest] + int(stream.offset_ms * 1e6) - self.begun_ns) / NS_PER_S
+                self.tally.gaps[place] = gap_s, f"{self.name} at {begins_s:.1f} s"
+        return seen
+
+    def _is_fresh(self, stream: Stream, ticks: Times) -> BoolArray:
+        newest = stream.newest(ticks)
+        return (newest >= 0) & (ticks - stream.times[newest] <= self.contract.max_age_ns(stream.source))
+
+    def _command(self, stream: Stream, ticks: Times) -> tuple[NDArray[np.float64], BoolArray]:
+        """(K, D) what was commanded from each tick to the next, and (K,) whether anything was."""
+        assert isinstance(stream.source, Commands)
+        from_, to = (np.searchsorted(stream.times, ticks + later) for later in (0, self.contract.period_ns))
+        last = np.maximum(to - 1, 0)
+        values = stream.values[last]
+        if stream.source.resample == "mean":
+            sums = np.concatenate([np.zeros((1, values.shape[1])), stream.values.cumsum(0)])
+            several = to - from_ > 1
+            values[several] = (sums[to] - sums[from_])[several] / (to - from_)[several, None]
+        return values, (to > from_) | self._is_fresh(stream, ticks)
+
+    def _commands(self, ticks: Times) -> tuple[NDArray[np.float64], BoolArray]:
+        """(K, A) commands in their units, and (K,) whether there is one of every topic."""
+        parts = [self._command(stream, ticks) for stream in self._actions]
+        return np.concatenate([values for values, _ in parts], 1), np.logical_and.reduce([has for _, has in parts])
+
+    def _relative(self, commands: NDArray[np.float64], states: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(K, A) commands, those of joints' targets as changes."""
+        names, commands = self.contract.state_names, commands.copy()
+        relative = [source.relative_to == "state" for source in self.contract.actions for _ in source.select]
+        for column in np.flatnonzero(relative):
+            commands[:, column] -= states[:, names.index(self.contract.action_names[column])]
+        return commands
+
+    def _scaled(self, commands: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(K, A), low to -1 and high to 1, not clipped."""
+        sources = self.contract.actions
+        low, high = (np.concatenate([getattr(source, name) for source in sources]) for name in ("low", "high"))
+        return np.asarray(2 * (commands - low) / (high - low) - 1)
+
+    def _count_commands(self, actions: NDArray[np.float64], commands: NDArray[np.float64]) -> None:
+        self.tally.steps += len(actions)
+        for column, name in enumerate(self.contract.action_names):
+            low, high = self.tally.commanded.get(name, (np.inf, -np.inf))
+            values = commands[:, column]
+            self.tally.commanded[name] = min(low, float(values.min())), max(high, float(values.max()))
+            self.tally.beyond[name] += int((np.abs(actions[:, column]) > 1 + 1e-6).sum())
+
+    def _success(self, ticks: Times, span: Span) -> BoolArray:
+        """(K,) success at each frame."""
+        success, says = np.zeros(len(ticks), bool), self.streams.get("success")
+        if says is None:
+            success[-1] = self._label(span)
+            return success
+        if not len(says.times):
+            self.tally.unlabelled += 1
+            return success
+        limit = self.contract.episodes.success.above
+        flags = says.values[:, 0] > (0 if limit is None else limit)
+        until = says.newest(np.append(ticks[:-1], span.until_ns - 1))
+        known = (until >= 0) & (says.times[until] >= span.start_ns)
+        self.tally.unlabelled += not known[-1]
+        success[:] = known & flags[until]
+        return success
+
+    def _rewards(self, ticks: Times) -> FloatArray:
+        """(T,) the newest reward at or before each of the ticks."""
+        says = self.streams.get("success")
+        if says is None or says.source.type == BOOL or not len(says.times):
+            return np.full(len(ticks), np.nan, np.float32)
+        newest = says.newest(ticks)
+        return np.where(newest >= 0, says.values[newest, 0], np.nan).astype(np.float32)
+
+    def _instruction(self, span: Span) -> str | None:
+        said = self.contract.episodes.instruction
+        if not isinstance(said, InstructionTopic):
+            return said
+        newest = int(self.streams["instruction"].newest(np.array([span.end_ns]))[0])
+        return self.streams["instruction"].texts[newest] if newest >= 0 else None
+
+    def _label(self, span: Span) -> bool:
+        offsets_ms = [stream.offset_ms for stream in self.streams.values() if stream.clock == "header"] or [0.0]
+        middle_ns = (span.start_ns + span.end_ns) / 2 + 1e6 * float(np.median(offsets_ms))
+        middle_s = (middle_ns - self.begun_ns) / NS_PER_S
+        for start_s, end_s, success in self._labels:
+            if start_s <= middle_s <= end_s:
+                return success
+        raise BagError(
+            f"{self.contract.episodes.success.file} has no row for {self.name} at {middle_s:.1f} s, the middle of an "
+            f"episode; add one: {','.join(LABEL_COLUMNS)}"
+        )
+
+
+def _stretches(joined: BoolArray) -> list[tuple[int, int]]:
+    """(start, steps) of each longest run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], joined, [0]])))
+    return [(int(start), int(end - start)) for start, end in edges.reshape(-1, 2)]
+
+
+def _labels_of(file: str, bag: str) -> Sequence[tuple[float, float, bool]]:
+    """(start s, end s, success) of a bag in the file of labels. Raises BagError: no such file, column or number."""
+    try:
+        with Path(file).open(newline="", encoding="utf-8") as stream:
+            return [
+                (float(row["start_s"] or 0), float(row["end_s"] or np.inf), bool(int(row["success"])))
+                for row in csv.DictReader(stream) if row["bag"] == bag
+            ]
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise BagError(f"labels {file} cannot be read: {error}; it is a CSV with the columns "
+                       f"{', '.join(LABEL_COLUMNS)}, success 0 or 1") from None
