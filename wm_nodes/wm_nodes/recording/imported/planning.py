@@ -62,7 +62,7 @@ class Tally:
     """What planning counted."""
 
     ticks: int = 0
-    """Of all spans."""
+    """Of all spans, from their first to their last command."""
     missing: Counter[str] = field(default_factory=Counter)
     """Ticks without a sample, by place in the contract."""
     lost: Counter[str] = field(default_factory=Counter)
@@ -139,6 +139,7 @@ class Planner:
             tally.lost_episodes["without a command"] += 1
             return []
         first, end = moved[0], min(moved[-1] + 2, len(ticks))
+        tally.lost["before the first command or after the last"] += len(ticks) - (end - first)
         ticks, commands, commanded = ticks[first:end], commands[first:end], commanded[first:end]
         instruction = self._instruction(span)
         if instruction is None:
@@ -252,12 +253,13 @@ class Planner:
         return success
 
     def _rewards(self, ticks: Times) -> FloatArray:
-        """(T,) the newest reward at or before each of the ticks."""
+        """(T,) the newest reward at or before each of the ticks, and after the tick before it."""
         says = self.streams.get("success")
         if says is None or says.source.type == BOOL or not len(says.times):
             return np.full(len(ticks), np.nan, np.float32)
         newest = says.newest(ticks)
-        return np.where(newest >= 0, says.values[newest, 0], np.nan).astype(np.float32)
+        is_of_step = (newest >= 0) & (says.times[newest] > ticks - self.contract.period_ns)
+        return np.where(is_of_step, says.values[newest, 0], np.nan).astype(np.float32)
 
     def _instruction(self, span: Span) -> str | None:
         said = self.contract.episodes.instruction

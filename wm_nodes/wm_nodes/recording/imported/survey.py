@@ -13,6 +13,8 @@ from wm_nodes.recording.imported.contract import Contract
 from wm_nodes.recording.imported.planning import PlannedEpisode, Planner, Tally
 from wm_nodes.recording.imported.streams import Stream, check_topics, read_streams
 
+ROS_1 = ".bag"
+
 
 @dataclass
 class TopicRow:
@@ -80,7 +82,7 @@ class Survey:
             *_aligned([("command", "limits", "commanded", "steps beyond"), *commands]), "",
             f"{len(self.planned)} bags: {len(episodes)} episodes, {tally.steps} steps of "
             f"{contract.period_ns / 1e6:g} ms; {successes} end in success",
-            *(f"left out: {count} of {tally.ticks} ticks {reason}" for reason, count in tally.lost.items() if count),
+            *(f"left out: {count} ticks {reason}" for reason, count in tally.lost.items() if count),
             *(f"left out: {count} stretches {reason}" for reason, count in tally.lost_episodes.items()),
         ]
         if tally.unlabelled:
@@ -112,6 +114,9 @@ def survey(paths: Sequence[Path], contract: Contract) -> Survey:
     """
     result = Survey(contract)
     for path in paths:
+        if path.suffix == ROS_1:
+            raise BagError(f"{path} is a bag of ROS 1; run `rosbags-convert --src {path} --dst {path.with_suffix('')}`"
+                           ", and import what it writes")
         with Bag(path) as bag:
             check_topics(bag, contract)
     for path in paths:

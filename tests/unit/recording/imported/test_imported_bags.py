@@ -1,0 +1,282 @@
+"""Plain bags become ours: what is seen at a tick, what is commanded until the next, where episodes begin and end."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from foreign_robot import (
+    BEGIN_NS,
+    EXAMPLE,
+    FRONT,
+    JOINTS,
+    MS,
+    TWIST,
+    Message,
+    Run,
+    compressed,
+    contract_file,
+    header,
+    image,
+    joint_state,
+    message,
+    twist,
+    write,
+)
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
+
+from wm_nodes.apps.cli import main
+from wm_nodes.config.load import load_config
+from wm_nodes.core.specs import SOURCE_REAL
+from wm_nodes.core.types import Episode
+from wm_nodes.policy_rl.pretraining import model_from_recordings
+from wm_nodes.recording import Bag, read_episodes, read_spec
+from wm_nodes.recording.episode_arrays import stack_episodes
+from wm_nodes.recording.imported import load_contract, survey
+from wm_nodes.recording.imported import write as write_import
+from wm_nodes.recording.imported.contract import Camera
+from wm_nodes.recording.imported.pictures import ENCODINGS, fitted, rgb_of
+from wm_nodes.world_model import load_model_folder
+
+FORMATS = [
+    (StoragePlugin.MCAP, CompressionMode.NONE), (StoragePlugin.MCAP, CompressionMode.FILE),
+    (StoragePlugin.SQLITE3, CompressionMode.NONE), (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
+]
+TINY = {
+    "task": "", "tokenizer.width": 32, "tokenizer.patch_px": 8, "tokenizer.num_iterations": 4,
+    "tokenizer.decoder_iterations": 0, "tokenizer.probe_iterations": 0, "world_model.width": 32,
+    "world_model.num_iterations": 4, "world_model.batch_size": 4, "world_model.rollout_steps": [2],
+    "reward.dense_weight": 0.0,
+}
+
+
+def imported(bags: list[Path], contract: Path, out: Path) -> list[Episode]:
+    write_import(survey(bags, load_contract(contract)), out)
+    return list(read_episodes(out))
+
+
+def one_topic(path: Path, messages: list[Message], **changes: Any) -> list[Episode]:
+    """The episodes of a bag of one camera, a state and a command, which is one episode."""
+    write(path / "bag", messages)
+    (path / "labels.csv").write_text("bag,start_s,end_s,success\nbag,,,1\n")
+    fixed = {
+        "timeline": "header", "observations__images__wrist": None, "observations__state__1": None, "actions__1": None,
+        "episodes__split": {"per": "bag"}, "episodes__success": {"file": "labels.csv"}, "episodes__min_steps": 1,
+    }
+    return imported([path / "bag"], contract_file(path / "contract.yaml", **{**fixed, **changes}), path / "out")
+
+
+def stream(steps: int, step_ms: int = 100, *, commands: Any = None, until: int | None = None) -> list[Message]:
+    """Every `step_ms`: a picture and a joint that count the steps, and a command 20 ms later."""
+    listed = list[Message]()
+    for step in range(steps):
+        now = BEGIN_NS + step * step_ms * MS
+        picture = np.full((64, 64, 3), step, np.uint8)
+        listed += [(now, FRONT, compressed(now, picture, "png")), (now, JOINTS, joint_state(now, j1=step, j2=0.0))]
+        if until is None or step < until:
+            x, y = commands(step) if commands else (0.01 * (step % 10), 0.0)
+            listed.append((now + 20 * MS, TWIST, twist(now + 20 * MS, x, y)))
+    return listed
+
+
+@pytest.mark.parametrize(("plugin", "mode"), FORMATS)
+def test_a_plain_bag_of_any_format_gives_the_same_episodes(
+    tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Run(3).write(tmp_path / "plain")
+    Run(3).write(tmp_path / "other", plugin, mode)
+    (ours, theirs) = ([*imported([tmp_path / name], EXAMPLE, tmp_path / f"{name}_out")] for name in ("plain", "other"))
+    assert len(ours) == 3 and [bool(episode.success[-1]) for episode in ours] == [True, False, True]
+    assert [episode.terminated for episode in ours] == [True, False, True]
+    assert [episode.truncated for episode in ours] == [False, True, False]
+    for one, same in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(one.images, same.images)
+        np.testing.assert_array_equal(one.actions, same.actions)
+    capsys.readouterr()
+
+
+def test_a_foreign_bag_becomes_a_world_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bags = [str(Run(3, seed=seed).write(tmp_path / f"run_{seed}")) for seed in range(2)]
+    out = tmp_path / "ours"
+    assert main(["import", "rosbag", str(EXAMPLE), *bags, "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "2 bags: 6 episodes, 120 steps of 100 ms; 4 end in success" in printed
+    spec, episodes = read_spec(out), list(read_episodes(out))
+    assert (spec.cameras, spec.height, spec.width, spec.source) == (("front", "wrist"), 64, 128, SOURCE_REAL)
+    assert spec.state_names == ("position.j1", "position.j2", "gripper.width") and spec.measured == (0, 1, 2)
+    assert spec.action_scale == pytest.approx((0.1, 0.1, 0.04)) and spec.control_period_s == 0.1
+    assert {episode.instruction for episode in episodes} == {"pick up the cup"}
+    with Bag(out) as bag:
+        assert "lab/my_arm" in bag.custom["wm.contract_yaml"] and "images.front" in bag.custom["wm.import_table"]
+    arrays = stack_episodes(episodes, (spec.task,), num_steps=spec.max_episode_steps)
+    assert arrays.images.shape == (6, 21, 64, 128, 3)
+    assert arrays.success[:, -1, 0].tolist() == [True, False, True] * 2
+    torch.set_num_threads(1)
+    folder = model_from_recordings([out], load_config("smoke", TINY), tmp_path / "model")
+    models = load_model_folder(folder)
+    assert models.tasks == ("pick_up_the_cup",) and models.spec.cameras == ("front", "wrist")
+
+
+def test_an_observation_is_the_newest_at_or_before_its_tick_and_an_action_what_was_commanded_until_the_next(
+    tmp_path: Path,
+) -> None:
+    (episode,) = one_topic(tmp_path, stream(6))
+    assert episode.images[:, 0, 0, 0].tolist() == [0, 1, 2, 3, 4, 5]
+    np.testing.assert_array_equal(episode.states[:, 0], [0, 1, 2, 3, 4, 5])
+    np.testing.assert_allclose(episode.actions[:, 0], [0, 0.1, 0.2, 0.3, 0.4], atol=1e-6)
+
+
+def test_a_picture_that_comes_after_its_tick_is_not_seen_at_it(tmp_path: Path) -> None:
+    def late(time_ns: int, topic: str, one: Any) -> Message:
+        later = time_ns + 30 * MS * (topic == FRONT and time_ns > BEGIN_NS)
+        if topic == FRONT:
+            one.header.stamp.nanosec += 30 * MS * (time_ns > BEGIN_NS)
+        return later, topic, one
+
+    (episode,) = one_topic(tmp_path, [late(*each) for each in stream(6)])
+    assert episode.images[:, 0, 0, 0].tolist() == [0, 0, 1, 2, 3, 4]
+
+
+def test_of_several_commands_in_a_step_the_mean_or_the_last_counts(tmp_path: Path) -> None:
+    messages = stream(5, commands=lambda step: (0.02, 0.0))
+    again = [(now, TWIST, twist(now, 0.06, 0.0)) for now in range(BEGIN_NS + 70 * MS, BEGIN_NS + 500 * MS, 100 * MS)]
+    for resample, expected in (("mean", 0.4), ("last", 0.6)):
+        folder = tmp_path / resample
+        folder.mkdir()
+        (episode,) = one_topic(folder, messages + again, actions__0__resample=resample)
+        np.testing.assert_allclose(episode.actions[:, 0], expected, atol=1e-6)
+
+
+def test_a_target_of_joints_may_count_as_the_change_from_the_state(tmp_path: Path) -> None:
+    def target(time_ns: int, step: int) -> Any:
+        duration = message("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
+        point = message("trajectory_msgs/msg/JointTrajectoryPoint", positions=np.array([0.5, step + 0.25]),
+                        velocities=np.zeros(0), accelerations=np.zeros(0), effort=np.zeros(0), time_from_start=duration)
+        return message("trajectory_msgs/msg/JointTrajectory", header=header(time_ns), joint_names=["j2", "j1"],
+                       points=[point])
+
+    messages = [each for each in stream(5) if each[1] != TWIST]
+    messages += [(now, TWIST, target(now, step)) for step, now in
+                 enumerate(range(BEGIN_NS + 20 * MS, BEGIN_NS + 500 * MS, 100 * MS))]
+    command = {"topic": TWIST, "type": "trajectory_msgs/msg/JointTrajectory", "select": ["position.j1", "position.j2"],
+               "unit": "rad", "low": [-1, -1], "high": [1, 1], "resample": "last", "relative_to": "state"}
+    (episode,) = one_topic(tmp_path, messages, actions__0=command)
+    np.testing.assert_allclose(episode.actions, [[0.25, 0.5]] * 4, atol=1e-6)
+
+
+def test_a_stretch_with_a_gap_is_lost_and_counted_and_nothing_is_filled(tmp_path: Path) -> None:
+    def has_camera(time_ns: int) -> bool:
+        return not BEGIN_NS + 800 * MS <= time_ns < BEGIN_NS + 1300 * MS
+
+    messages = [each for each in stream(24) if each[1] != FRONT or has_camera(each[0])]
+    episodes = one_topic(tmp_path, messages)
+    shown = [episode.images[:, 0, 0, 0].tolist() for episode in episodes]
+    assert shown == [[*range(8), 7], [*range(13, 24)]]  # picture 7 is 100 ms old at the next tick, of 150 allowed
+    assert [bool(episode.success[-1]) for episode in episodes] == [False, True]
+    report = survey([tmp_path / "bag"], load_contract(tmp_path / "contract.yaml"))
+    assert report.tally.missing["images.front"] == 4
+    assert "0.60 s in bag at 0.7 s" in report.table() and "left out: " in report.table()
+
+
+def test_what_comes_before_the_first_command_and_after_the_last_is_no_part_of_an_episode(tmp_path: Path) -> None:
+    (episode,) = one_topic(tmp_path, stream(12, until=5), max_age_ms=110)
+    assert episode.images[:, 0, 0, 0].tolist() == list(range(7)) and episode.success[-1]
+    report = survey([tmp_path / "bag"], load_contract(tmp_path / "contract.yaml"))
+    assert "left out: 5 ticks before the first command or after the last" in report.table()
+
+
+def test_a_long_episode_is_cut_into_parts_and_no_step_is_lost(tmp_path: Path) -> None:
+    episodes = one_topic(tmp_path, stream(12), episodes__max_steps=4)
+    assert [episode.num_steps for episode in episodes] == [4, 4, 3]
+    assert [episode.images[0, 0, 0, 0] for episode in episodes] == [0, 4, 8]
+    assert [bool(episode.success[-1]) for episode in episodes] == [False, False, True]
+    assert read_spec(tmp_path / "out").max_episode_steps == 4
+
+
+def test_episodes_lie_between_silences_of_the_commands(tmp_path: Path) -> None:
+    bag = Run(3).write(tmp_path / "bag")
+    contract = contract_file(tmp_path / "contract.yaml", episodes__split={"gap_s": 1.0})
+    episodes = imported([bag], contract, tmp_path / "out")
+    assert [episode.num_steps for episode in episodes] == [20, 20, 20]
+    assert [bool(episode.success[-1]) for episode in episodes] == [True, False, True]
+
+
+def test_labels_of_a_file_and_instructions_of_a_topic_count_for_their_episodes(tmp_path: Path) -> None:
+    def said(messages: list[Message]) -> list[Message]:
+        begins = [time_ns for time_ns, topic, one in messages if topic == "/episode" and one.data]
+        return messages + [(time_ns - MS, "/say", message("std_msgs/msg/String", data=f"cup {number}"))
+                           for number, time_ns in enumerate(begins)]
+
+    bag = Run(2, change=said).write(tmp_path / "bag")
+    (tmp_path / "labels.csv").write_text("bag,start_s,end_s,success\nbag,0,4,0\nbag,5,9,1\nother,,,1\n")
+    contract = contract_file(tmp_path / "contract.yaml", episodes__success={"file": "labels.csv"},
+                             episodes__instruction={"topic": "/say"})
+    episodes = imported([bag], contract, tmp_path / "out")
+    assert [(one.instruction, bool(one.success[-1])) for one in episodes] == [("cup 0", False), ("cup 1", True)]
+
+
+def test_a_reward_is_recorded_and_says_where_success_begins(tmp_path: Path) -> None:
+    pays = [(BEGIN_NS + step * 100 * MS, "/reward", message("std_msgs/msg/Float64", data=0.25 * step))
+            for step in range(6)]
+    rule = {"topic": "/reward", "type": "std_msgs/msg/Float64", "above": 0.6}
+    (episode,) = one_topic(tmp_path, stream(6) + pays, episodes__success=rule)
+    assert episode.success.tolist() == [False, False, False, True, True, True]
+    np.testing.assert_allclose(episode.rewards, [0.25, 0.5, 0.75, 1.0, 1.25])
+
+
+def test_where_stamps_lie_in_another_era_the_time_of_reception_or_of_all_stamps_may_count(tmp_path: Path) -> None:
+    shifted = [(time_ns + 40 * 10**9, topic, one) for time_ns, topic, one in stream(6)]
+    for timeline in ("header", "receive"):
+        folder = tmp_path / timeline
+        folder.mkdir()
+        (episode,) = one_topic(folder, shifted, timeline=timeline)
+        assert episode.num_steps == 5
+
+
+def test_commands_beyond_the_limits_are_counted_and_clipped_where_that_is_asked_for(tmp_path: Path) -> None:
+    (episode,) = one_topic(tmp_path, stream(6, commands=lambda step: (0.1 * step, 0.0)), beyond_limits="clip")
+    np.testing.assert_allclose(episode.actions[:, 0], [0, 1, 1, 1, 1], atol=1e-6)
+    with Bag(tmp_path / "out") as bag:
+        assert re.search(r"-0.1 to 0.1 m/s +0 to 0.4 +3 \(60.0%\)", bag.custom["wm.import_table"])
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("padding", [0, 3])
+def test_an_image_of_any_usual_encoding_is_read_as_rgb(encoding: str, padding: int) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (4, 6, 3), dtype=np.uint8)
+    alpha = np.full((4, 6, 1), 9, np.uint8)
+    stored = {"rgb8": rgb, "bgr8": rgb[..., ::-1], "rgba8": np.concatenate([rgb, alpha], -1),
+              "bgra8": np.concatenate([rgb[..., ::-1], alpha], -1), "mono8": rgb[..., :1]}[encoding]
+    expected = np.repeat(rgb[..., :1], 3, -1) if encoding == "mono8" else rgb
+    np.testing.assert_array_equal(rgb_of(image(0, stored, encoding, padding)), expected)
+
+
+@pytest.mark.parametrize(("crop", "left", "right"), [("centre", 32, 95), ("none", 0, 127), ((0, 64, 96, 64), 64, 127)])
+def test_a_crop_keeps_the_part_that_it_names(crop: Any, left: int, right: int) -> None:
+    ramp = np.repeat(np.arange(128, dtype=np.uint8)[None, :, None], 96, 0).repeat(3, -1)
+    size = (48, 32) if crop != "none" else (48, 64)
+    camera = Camera(topic="/c", type="sensor_msgs/msg/Image", size=size, crop=crop)
+    made = fitted(ramp, camera)
+    assert made.shape == (*size, 3) and abs(int(made[0, 0, 0]) - left) <= 1 and abs(int(made[0, -1, 0]) - right) <= 1
+
+
+def test_a_damaged_picture_costs_its_episode_and_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def damage(messages: list[Message]) -> list[Message]:
+        pictures = [one for _, topic, one in messages if topic == FRONT]
+        for one in pictures[-20:-10]:
+            one.data = np.zeros(9, np.uint8)
+        return messages
+
+    bag = Run(2, change=damage).write(tmp_path / "bag")
+    assert main(["import", "rosbag", str(EXAMPLE), str(bag), "--out", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    assert printed.count(f"left out: episode 2 of bag: {FRONT}: a 'rgb8; jpeg compressed bgr8' picture of 9 bytes") == 1
+    assert len(list(read_episodes(tmp_path / "out"))) == 1
+
+
+def test_joints_that_another_driver_publishes_on_the_same_topic_are_no_samples(tmp_path: Path) -> None:
+    grippers = [(now, JOINTS, joint_state(now, finger=1.0)) for now in range(BEGIN_NS, BEGIN_NS + 600 * MS, 50 * MS)]
+    (episode,) = one_topic(tmp_path, stream(6) + grippers)
+    np.testing.assert_array_equal(episode.states[:, 0], [0, 1, 2, 3, 4, 5])

@@ -1,0 +1,196 @@
+"""What a contract, or a bag that does not fit it, is refused for: value and remedy, before anything is written."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from foreign_robot import (
+    EXAMPLE,
+    FRONT,
+    JOINTS,
+    MS,
+    TWIST,
+    WRIST,
+    Message,
+    Run,
+    contract_file,
+    image,
+    joint_state,
+    message,
+    seen,
+)
+
+from wm_nodes.apps.cli import main
+from wm_nodes.config.load import ConfigError
+from wm_nodes.recording import BagError
+from wm_nodes.recording.imported import load_contract, survey
+
+Change = Callable[[list[Message]], list[Message]]
+
+CONTRACTS: list[tuple[dict[str, Any], str]] = [
+    ({"decoder": "my.module"}, "decoder: Extra inputs are not permitted"),
+    ({"observations__images__front__typo": 1}, "observations.images.front.typo: Extra inputs"),
+    ({"format": 2}, "format: Input should be 1"),
+    ({"timeline": None}, "timeline: Field required"),
+    ({"rate_hz": 0}, "rate_hz: Input should be greater than 0"),
+    ({"observations__images__wrist__size": [32, 32]}, "give all of them one size"),
+    ({"observations__images__front__topic": "front"}, "observations.images.front.topic: String should match"),
+    ({"observations__state__0__names": ["a"]}, "/joint_states selects 2 values, but has {'names': 1}"),
+    ({"observations__state__1__names": ["position.j1"]}, "several state values are called position.j1"),
+    ({"observations__state__1__names": ["gripper_target"]}, "called gripper_target, but 'target' means commanded"),
+    ({"actions__0__low": [0.2, 0.2]}, "must be below high"),
+    ({"actions__0__high": [0.2]}, "selects 2 values, but has {'high': 1}"),
+    ({"actions__0__relative_to": "state"}, "relative to the state, which has no twist.linear.x"),
+    ({"episodes__split": {"per": "bag", "gap_s": 1.0}}, "give one of topic: /NAME, per: bag, gap_s: SECONDS"),
+    ({"episodes__success": {"topic": "/s", "file": "l.csv"}}, "give one of topic: /NAME and file: LABELS.csv"),
+    ({"episodes__success": {"topic": "/s", "above": 1.0}}, "give it with std_msgs/msg/Float64"),
+]
+
+
+@pytest.mark.parametrize(("changes", "words"), CONTRACTS, ids=[words[:40] for _, words in CONTRACTS])
+def test_a_contract_that_says_no_sense_is_refused_by_what_is_wrong(
+    tmp_path: Path, changes: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ConfigError) as refused:
+        load_contract(contract_file(tmp_path / "contract.yaml", **changes))
+    assert words in str(refused.value) and "contract.yaml" in str(refused.value)
+
+
+def without(topic: str) -> Change:
+    return lambda messages: [each for each in messages if each[1] != topic]
+
+
+def pictures(encoding: str, picture: Any) -> Change:
+    return lambda messages: [
+        (time_ns, topic, image(time_ns, picture, encoding) if topic == WRIST else one)
+        for time_ns, topic, one in messages
+    ]
+
+
+def growing(messages: list[Message]) -> list[Message]:
+    half = messages[len(messages) // 2][0]
+    return [(time_ns, topic, image(time_ns, seen(0, 0, 64 + 32 * (time_ns > half), 96)) if topic == WRIST else one)
+            for time_ns, topic, one in messages]
+
+
+def stamped(topic: str, change: Callable[[int], int]) -> Change:
+    def restamp(messages: list[Message]) -> list[Message]:
+        for _, name, one in messages:
+            if name == topic:
+                time_ns = change(one.header.stamp.sec * 10**9 + one.header.stamp.nanosec)
+                one.header.stamp.sec, one.header.stamp.nanosec = divmod(time_ns, 10**9)
+        return messages
+
+    return restamp
+
+
+def slow(topic: str, keep: int) -> Change:
+    def thin(messages: list[Message]) -> list[Message]:
+        kept = [each for each in messages if each[1] == topic][::keep]
+        return [each for each in messages if each[1] != topic] + kept
+
+    return thin
+
+
+def plans(messages: list[Message]) -> list[Message]:
+    duration = message("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
+    point = message("trajectory_msgs/msg/JointTrajectoryPoint", positions=np.zeros(1), velocities=np.zeros(0),
+                    accelerations=np.zeros(0), effort=np.zeros(0), time_from_start=duration)
+    return [(time_ns, topic, message("trajectory_msgs/msg/JointTrajectory", header=one.header, joint_names=["j1"],
+                                     points=[point, point]) if topic == TWIST else one)
+            for time_ns, topic, one in messages]
+
+
+PLAN = {"topic": TWIST, "type": "trajectory_msgs/msg/JointTrajectory", "select": ["position.j1"], "unit": "rad",
+        "low": [-1], "high": [1], "resample": "last"}
+COLOURS = np.zeros((64, 64, 3), np.uint8)
+BAGS: dict[str, tuple[Change | None, dict[str, Any], str]] = {
+    "missing topic": (without(WRIST), {}, "images.wrist: no message on /wrist/image_raw; topics of "
+                      "sensor_msgs/msg/Image: none"),
+    "misspelt topic": (None, {"observations__state__0__topic": "/joint_state"},
+                       "state.0: no message on /joint_state; topics of sensor_msgs/msg/JointState: /joint_states"),
+    "wrong type": (None, {"actions__0__type": "geometry_msgs/msg/Twist"},
+                   "/servo/delta_twist_cmds is of geometry_msgs/msg/TwistStamped, not geometry_msgs/msg/Twist"),
+    "slow camera": (slow(FRONT, 4), {"max_age_ms": 500}, "images.front: /front/image_raw/compressed comes with 5 Hz, "
+                    "less than rate_hz 10: pictures would repeat; lower rate_hz"),
+    "slow state": (slow(JOINTS, 20), {}, "comes with 2.5 Hz, and max_age_ms 150 asks for 6.67; raise its max_age_ms"),
+    "small picture": (pictures("rgb8", COLOURS[:32, :32]), {}, "keep 32 x 32 px of 32 x 32, less than size [64, 64]"),
+    "changing size": (growing, {}, "has pictures of [(64, 96), (96, 96)] px; import bags of one size"),
+    "crop": (None, {"observations__images__wrist__crop": [0, 10, 64, 64]},
+             "have 64 x 64 px, and crop [0, 10, 64, 64] leaves them"),
+    "depth": (pictures("16UC1", np.zeros((64, 64), np.uint16)), {}, "encoding '16UC1' is depth, which is not read"),
+    "encoding": (pictures("yuv422", COLOURS), {}, "encoding 'yuv422' is not read; publish one of rgb8, bgr8"),
+    "no such joint": (None, {"observations__state__0__select": ["position.j1", "position.j9"]},
+                      "no usable message with position.j1, position.j9"),
+    "no velocities": (None, {"observations__state__0__select": ["velocity.j1", "velocity.j2"]},
+                      "no usable message with velocity.j1"),
+    "no such field": (None, {"actions__0__select": ["twist.linear.x", "twist.linear.w"]},
+                      "has no 'twist.linear.w'; at 'w' there is x, y, z"),
+    "no number": (None, {"actions__0__select": ["twist.linear.x", "twist.linear"]},
+                  "is no number; select one field of it"),
+    "form of joints": (None, {"observations__state__0__select": ["j1", "j2"]}, "has no 'j1'; select position.JOINT"),
+    "a plan": (plans, {"actions__0": PLAN}, "of 2 points is a plan, not a command of one step"),
+    "no stamps": (stamped(JOINTS, lambda now: 0), {}, "/joint_states has header stamps of 0; set its timeline"),
+    "stamps set back": (stamped(JOINTS, lambda now: now - 3 * 10**9 * (now % 10**10 > 5 * 10**9)), {},
+                        "has stamps that fall by 1.1 s; set its timeline to receive"),
+    "clocks apart": (stamped(FRONT, lambda now: now - 900 * MS), {}, "lie 905 ms apart, and max_clock_offset_ms is "
+                     "500; set timeline to receive, or synchronise"),
+    "header of none": (None, {"observations__state__1__timeline": "header"},
+                       "std_msgs/msg/Float64MultiArray has no header"),
+    "beyond": (None, {"actions__0__low": [-0.05, -0.1]}, "commands leave the limits: twist.linear.x from -0.09"),
+    "no success": (without("/success"), {}, "success: no message on /success in any bag; correct the topic"),
+    "too short": (None, {"episodes__min_steps": 50}, "no episode in "),
+    "no labels": (None, {"episodes__success": {"file": "nothing.csv"}}, "nothing.csv cannot be read"),
+}
+
+
+@pytest.mark.parametrize("case", BAGS)
+def test_a_bag_that_does_not_fit_the_contract_is_refused_with_the_remedy_and_nothing_is_written(
+    tmp_path: Path, case: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change, changes, words = BAGS[case]
+    bag = Run(2, **({"change": change} if change else {})).write(tmp_path / "bag")
+    contract = contract_file(tmp_path / "contract.yaml", **changes)
+    assert main(["import", "rosbag", str(contract), str(bag), "--out", str(tmp_path / "out")]) == 2
+    refused = capsys.readouterr().err.splitlines()[-1]
+    assert refused.startswith("error: ") and words in refused, refused
+    assert not [*tmp_path.glob("out*")]
+
+
+def test_an_episode_without_a_label_is_named_by_its_bag_and_time(tmp_path: Path) -> None:
+    bag = Run(2).write(tmp_path / "bag")
+    (tmp_path / "labels.csv").write_text("bag,start_s,end_s,success\nbag,0,4,1\n")
+    contract = contract_file(tmp_path / "contract.yaml", episodes__success={"file": "labels.csv"})
+    with pytest.raises(BagError, match=r"has no row for bag at 7\.0 s, the middle of an episode; add one: bag,start_s"):
+        survey([bag], load_contract(contract))
+
+
+def test_a_bag_of_ros_1_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match=r"run `rosbags-convert --src \S+run\.bag --dst \S+run`"):
+        survey([tmp_path / "run.bag"], load_contract(EXAMPLE))
+
+
+def test_every_problem_of_a_bag_is_named_at_once(tmp_path: Path) -> None:
+    bag = Run(2).write(tmp_path / "bag")
+    contract = contract_file(tmp_path / "contract.yaml", observations__state__0__topic="/joints",
+                             observations__images__front__topic="/front")
+    with pytest.raises(BagError, match=r"images\.front: no message on /front.*state\.0: no message on /joints"):
+        survey([bag], load_contract(contract))
+
+
+def test_without_a_folder_the_table_is_all_that_is_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = Run(1).write(tmp_path / "bag")
+    assert main(["import", "rosbag", str(EXAMPLE), str(bag)]) == 0
+    assert "1 bags: 1 episodes, 20 steps" in capsys.readouterr().out and [*tmp_path.iterdir()] == [bag]
+
+
+def test_a_joint_that_no_message_has_is_refused_with_those_that_there_are(tmp_path: Path) -> None:
+    def renamed(messages: list[Message]) -> list[Message]:
+        return [(time_ns, topic, joint_state(time_ns, a=0.0, b=1.0) if topic == JOINTS else one)
+                for time_ns, topic, one in messages]
+
+    bag = Run(1, change=renamed).write(tmp_path / "bag")
+    with pytest.raises(BagError, match=r"no usable message .*\(105 others, and the last one names a, b\)"):
+        survey([bag], load_contract(EXAMPLE))
