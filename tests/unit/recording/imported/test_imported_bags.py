@@ -18,10 +18,12 @@ from foreign_robot import (
     Run,
     compressed,
     contract_file,
+    flag,
     header,
     image,
     joint_state,
     message,
+    numbers,
     twist,
     write,
 )
@@ -32,11 +34,12 @@ from wm_nodes.config.load import load_config
 from wm_nodes.core.specs import SOURCE_REAL
 from wm_nodes.core.types import Episode
 from wm_nodes.policy_rl.pretraining import model_from_recordings
-from wm_nodes.recording import Bag, read_episodes, read_spec
+from wm_nodes.recording import Bag, RawBagWriter, read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.recording.imported import load_contract, survey
 from wm_nodes.recording.imported import write as write_import
 from wm_nodes.recording.imported.contract import Camera
+from wm_nodes.recording.imported.numbers import Selector
 from wm_nodes.recording.imported.pictures import ENCODINGS, fitted, rgb_of
 from wm_nodes.world_model import load_model_folder
 
@@ -97,12 +100,26 @@ def test_a_plain_bag_of_any_format_gives_the_same_episodes(
     capsys.readouterr()
 
 
+def test_a_bag_that_was_split_into_files_gives_the_same_episodes(tmp_path: Path) -> None:
+    plain = Run(2).write(tmp_path / "plain")
+    with Bag(plain) as bag, RawBagWriter(tmp_path / "parts", chunk_bytes=20_000, split_bytes=20_000) as writer:
+        for connection in bag.connections:
+            writer.copy_topic(connection)
+        for topic, time_ns, data in bag.messages():
+            writer.write(topic, data, time_ns)
+    assert len([*(tmp_path / "parts").glob("*.mcap")]) > 2
+    ours, theirs = (imported([tmp_path / name], EXAMPLE, tmp_path / f"{name}_out") for name in ("plain", "parts"))
+    for one, same in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(one.images, same.images)
+        np.testing.assert_array_equal(one.states, same.states)
+
+
 def test_a_foreign_bag_becomes_a_world_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bags = [str(Run(3, seed=seed).write(tmp_path / f"run_{seed}")) for seed in range(2)]
     out = tmp_path / "ours"
     assert main(["import", "rosbag", str(EXAMPLE), *bags, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert "2 bags: 6 episodes, 120 steps of 100 ms; 4 end in success" in printed
+    assert "bags: 2; episodes: 6, 4 of them end in success; steps: 120 of 100 ms" in printed
     spec, episodes = read_spec(out), list(read_episodes(out))
     assert (spec.cameras, spec.height, spec.width, spec.source) == (("front", "wrist"), 64, 128, SOURCE_REAL)
     assert spec.state_names == ("position.j1", "position.j2", "gripper.width") and spec.measured == (0, 1, 2)
@@ -240,6 +257,29 @@ def test_commands_beyond_the_limits_are_counted_and_clipped_where_that_is_asked_
     np.testing.assert_allclose(episode.actions[:, 0], [0, 1, 1, 1, 1], atol=1e-6)
     with Bag(tmp_path / "out") as bag:
         assert re.search(r"-0.1 to 0.1 m/s +0 to 0.4 +3 \(60.0%\)", bag.custom["wm.import_table"])
+
+
+POINT = message("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0)
+TURN = message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.6, w=0.8)
+POSE = message("geometry_msgs/msg/PoseStamped", header=header(0),
+               pose=message("geometry_msgs/msg/Pose", position=POINT, orientation=TURN))
+LAYOUT = message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+
+
+@pytest.mark.parametrize(("one", "select", "expected"), [
+    (POSE, ["pose.position.z", "pose.orientation.w"], [3.0, 0.8]),
+    (twist(0, 0.1, -0.2), ["twist.linear.y"], [-0.2]),
+    (joint_state(0, a=1.0, b=2.0), ["position.b", "position.a"], [2.0, 1.0]),
+    (numbers(1.0, 2.0, 3.0), ["2", "0"], [3.0, 1.0]),
+    (message("std_msgs/msg/Float32MultiArray", layout=LAYOUT, data=np.array([0.5], np.float32)), ["0"], [0.5]),
+    (message("sensor_msgs/msg/Joy", header=header(0), axes=np.ones(2, np.float32), buttons=np.array([0, 1], np.int32)),
+     ["axes.1", "buttons.1"], [1.0, 1.0]),
+    (flag(True), ["data"], [1.0]),
+    (numbers(1.0), ["1"], None),
+    (numbers(np.nan), ["0"], None),
+])
+def test_numbers_are_selected_by_their_dotted_names(one: Any, select: list[str], expected: list[float] | None) -> None:
+    assert Selector(one.__msgtype__, select)(one) == (expected if expected is None else pytest.approx(expected))
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)

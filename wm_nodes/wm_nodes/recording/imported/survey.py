@@ -80,8 +80,8 @@ class Survey:
         lines = [
             *_aligned([header, *rows]), "",
             *_aligned([("command", "limits", "commanded", "steps beyond"), *commands]), "",
-            f"{len(self.planned)} bags: {len(episodes)} episodes, {tally.steps} steps of "
-            f"{contract.period_ns / 1e6:g} ms; {successes} end in success",
+            f"bags: {len(self.planned)}; episodes: {len(episodes)}, {successes} of them end in success; steps: "
+            f"{tally.steps} of {contract.period_ns / 1e6:g} ms",
             *(f"left out: {count} ticks {reason}" for reason, count in tally.lost.items() if count),
             *(f"left out: {count} stretches {reason}" for reason, count in tally.lost_episodes.items()),
         ]
