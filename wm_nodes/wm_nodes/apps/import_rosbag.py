@@ -13,6 +13,7 @@ next. A stretch with a gap is left out and counted, never filled.
 import argparse
 from pathlib import Path
 
+from wm_nodes.recording import BagError
 from wm_nodes.recording.imported import load_contract, survey, write
 
 
@@ -24,6 +25,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Print the table, then write."""
+    if arguments.out is not None and arguments.out.exists():
+        raise BagError(f"{arguments.out} exists already; choose another name or remove it")
     seen = survey(arguments.bags, load_contract(arguments.contract))
     print(seen.table())
     if arguments.out is None:

@@ -194,14 +194,23 @@ def test_a_stretch_with_a_gap_is_lost_and_counted_and_nothing_is_filled(tmp_path
     assert [bool(episode.success[-1]) for episode in episodes] == [False, True]
     report = survey([tmp_path / "bag"], load_contract(tmp_path / "contract.yaml"))
     assert report.tally.missing["images.front"] == 4
-    assert "0.60 s in bag at 0.7 s" in report.table() and "left out: " in report.table()
+    assert "0.60 s in bag at 0.7 s" in report.table()
+    assert "left out: 5 steps in gaps and short stretches" in report.table()
+
+
+def test_a_success_whose_end_lies_in_a_gap_is_no_success_and_counted(tmp_path: Path) -> None:
+    messages = [each for each in stream(24) if each[1] != FRONT or each[0] < BEGIN_NS + 1900 * MS]
+    (episode,) = one_topic(tmp_path, messages)
+    assert not episode.success.any() and episode.truncated
+    report = survey([tmp_path / "bag"], load_contract(tmp_path / "contract.yaml"))
+    assert "left out: 1 stretches with a success at the end" in report.table()
 
 
 def test_what_comes_before_the_first_command_and_after_the_last_is_no_part_of_an_episode(tmp_path: Path) -> None:
     (episode,) = one_topic(tmp_path, stream(12, until=5), max_age_ms=110)
     assert episode.images[:, 0, 0, 0].tolist() == list(range(7)) and episode.success[-1]
     report = survey([tmp_path / "bag"], load_contract(tmp_path / "contract.yaml"))
-    assert "left out: 5 ticks before the first command or after the last" in report.table()
+    assert "left out: 5 steps before the first command or after the last" in report.table()
 
 
 def test_a_long_episode_is_cut_into_parts_and_no_step_is_lost(tmp_path: Path) -> None:

@@ -172,6 +172,13 @@ def test_a_bag_of_ros_1_is_refused_with_the_command_that_converts_it(tmp_path: P
         survey([tmp_path / "run.bag"], load_contract(EXAMPLE))
 
 
+def test_a_folder_that_exists_is_refused_before_a_bag_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["import", "rosbag", str(EXAMPLE), str(tmp_path / "nothing"), "--out", str(tmp_path)]) == 2
+    assert "exists already; choose another name" in capsys.readouterr().err
+
+
 def test_every_problem_of_a_bag_is_named_at_once(tmp_path: Path) -> None:
     bag = Run(2).write(tmp_path / "bag")
     contract = contract_file(tmp_path / "contract.yaml", observations__state__0__topic="/joints",

@@ -66,7 +66,7 @@ class Tally:
     missing: Counter[str] = field(default_factory=Counter)
     """Ticks without a sample, by place in the contract."""
     lost: Counter[str] = field(default_factory=Counter)
-    """Ticks of no episode, by reason."""
+    """Steps of no episode, by reason."""
     lost_episodes: Counter[str] = field(default_factory=Counter)
     """Stretches and spans that became no episode, by reason."""
     gaps: dict[str, tuple[float, str]] = field(default_factory=dict)
@@ -145,7 +145,7 @@ class Planner:
         if instruction is None:
             tally.lost_episodes["without an instruction"] += 1
             return []
-        seen = self._seen(ticks, commanded, span)
+        seen = self._seen(ticks)
         joined = seen[:-1] & seen[1:] & commanded[:-1]
         success = self._success(ticks, span)
         pictures = np.stack([stream.numbers[stream.newest(ticks)] for stream in self._images], 1)
@@ -168,10 +168,12 @@ class Planner:
                     np.clip(actions[rows], -1, 1).astype(np.float32), success[frames], self._rewards(ticks[frames][1:]),
                     instruction,
                 ))
-        tally.lost["in or beside a gap"] += len(joined) - covered
+        tally.lost["in gaps and short stretches"] += len(joined) - covered
+        if success[-1] and not (planned and planned[-1].ticks[-1] == ticks[-1]):
+            tally.lost_episodes["with a success at the end"] += 1
         return planned
 
-    def _seen(self, ticks: Times, commanded: BoolArray, span: Span) -> BoolArray:
+    def _seen(self, ticks: Times) -> BoolArray:
         """(K,) whether every observed topic has a sample that is new enough; counts ticks without one, and gaps."""
         seen = np.ones(len(ticks), bool)
         self.tally.ticks += len(ticks)

@@ -82,7 +82,7 @@ class Survey:
             *_aligned([("command", "limits", "commanded", "steps beyond"), *commands]), "",
             f"bags: {len(self.planned)}; episodes: {len(episodes)}, {successes} of them end in success; steps: "
             f"{tally.steps} of {contract.period_ns / 1e6:g} ms",
-            *(f"left out: {count} ticks {reason}" for reason, count in tally.lost.items() if count),
+            *(f"left out: {count} steps {reason}" for reason, count in tally.lost.items() if count),
             *(f"left out: {count} stretches {reason}" for reason, count in tally.lost_episodes.items()),
         ]
         if tally.unlabelled:
@@ -112,7 +112,7 @@ def survey(paths: Sequence[Path], contract: Contract) -> Survey:
     Raises:
         BagError: names what does not fit the contract, with the remedies.
     """
-    result = Survey(contract)
+    result, paths = Survey(contract), list(dict.fromkeys(paths))
     for path in paths:
         if path.suffix == ROS_1:
             raise BagError(f"{path} is a bag of ROS 1; run `rosbags-convert --src {path} --dst {path.with_suffix('')}`"
