@@ -142,7 +142,19 @@ def test_an_observation_is_the_newest_at_or_before_its_tick_and_an_action_what_w
     (episode,) = one_topic(tmp_path, stream(6))
     assert episode.images[:, 0, 0, 0].tolist() == [0, 1, 2, 3, 4, 5]
     np.testing.assert_array_equal(episode.states[:, 0], [0, 1, 2, 3, 4, 5])
-    np.testing.assert_allclose(episode.actions[:, 0], [0, 0.1, 0.2, 0.3, 0.4], atol=1e-6)
+    # a command comes 20 ms after the tick: until then the one before holds
+    np.testing.assert_allclose(episode.actions[:, 0], [0, 0.08, 0.18, 0.28, 0.38], atol=1e-6)
+
+
+def test_an_action_explains_the_change_of_its_step_and_not_that_of_the_step_beside_it(tmp_path: Path) -> None:
+    episodes = imported([Run(4, seed=3).write(tmp_path / "bag")], EXAMPLE, tmp_path / "out")
+    moved = np.concatenate([np.diff(episode.states[:, 0])[1:-1] for episode in episodes])
+
+    def correlation(lag: int) -> float:
+        actions = [np.roll(episode.actions[:, 0], lag)[1:-1] for episode in episodes]
+        return float(np.corrcoef(moved, np.concatenate(actions))[0, 1])
+
+    assert correlation(0) > 0.99 and abs(correlation(1)) < 0.5 and abs(correlation(-1)) < 0.5
 
 
 def test_a_picture_that_comes_after_its_tick_is_not_seen_at_it(tmp_path: Path) -> None:
@@ -156,10 +168,11 @@ def test_a_picture_that_comes_after_its_tick_is_not_seen_at_it(tmp_path: Path) -
     assert episode.images[:, 0, 0, 0].tolist() == [0, 0, 1, 2, 3, 4]
 
 
-def test_of_several_commands_in_a_step_the_mean_or_the_last_counts(tmp_path: Path) -> None:
+def test_of_several_commands_in_a_step_the_mean_over_time_or_the_last_counts(tmp_path: Path) -> None:
     messages = stream(5, commands=lambda step: (0.02, 0.0))
     again = [(now, TWIST, twist(now, 0.06, 0.0)) for now in range(BEGIN_NS + 70 * MS, BEGIN_NS + 500 * MS, 100 * MS)]
-    for resample, expected in (("mean", 0.4), ("last", 0.6)):
+    expect: dict[str, list[float]] = {"mean": [0.35, 0.4, 0.4, 0.4], "last": [0.6] * 4}
+    for resample, expected in expect.items():
         folder = tmp_path / resample
         folder.mkdir()
         (episode,) = one_topic(folder, messages + again, actions__0__resample=resample)
@@ -263,9 +276,9 @@ def test_where_stamps_lie_in_another_era_the_time_of_reception_or_of_all_stamps_
 
 def test_commands_beyond_the_limits_are_counted_and_clipped_where_that_is_asked_for(tmp_path: Path) -> None:
     (episode,) = one_topic(tmp_path, stream(6, commands=lambda step: (0.1 * step, 0.0)), beyond_limits="clip")
-    np.testing.assert_allclose(episode.actions[:, 0], [0, 1, 1, 1, 1], atol=1e-6)
+    np.testing.assert_allclose(episode.actions[:, 0], [0, 0.8, 1, 1, 1], atol=1e-6)
     with Bag(tmp_path / "out") as bag:
-        assert re.search(r"-0.1 to 0.1 m/s +0 to 0.4 +3 \(60.0%\)", bag.custom["wm.import_table"])
+        assert re.search(r"-0.1 to 0.1 m/s +0 to 0.38 +3 \(60.0%\)", bag.custom["wm.import_table"])
 
 
 POINT = message("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0)

@@ -139,7 +139,7 @@ BAGS: dict[str, tuple[Change | None, dict[str, Any], str]] = {
                      "500; set timeline to receive, or synchronise"),
     "header of none": (None, {"observations__state__1__timeline": "header"},
                        "std_msgs/msg/Float64MultiArray has no header"),
-    "beyond": (None, {"actions__0__low": [-0.05, -0.1]}, "commands leave the limits: twist.linear.x from -0.09"),
+    "beyond": (None, {"actions__0__low": [-0.05, -0.1]}, "commands leave the limits: twist.linear.x from -0.06"),
     "no success": (without("/success"), {}, "success: no message on /success in any bag; correct the topic"),
     "too short": (None, {"episodes__min_steps": 50}, "no episode in "),
     "no labels": (None, {"episodes__success": {"file": "nothing.csv"}}, "nothing.csv cannot be read"),

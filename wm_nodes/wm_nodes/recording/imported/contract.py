@@ -72,8 +72,8 @@ class Commands(Numbers):
     high: Annotated[tuple[float, ...], Field(min_length=1)]
     """The command that becomes the action 1."""
     resample: Literal["mean", "last"]
-    """Of several commands in one step: their mean (velocities) or the last one (positions). Without one, the newest
-    before it holds while it is not older than max_age_ms."""
+    """What the action of a step is: the mean over its time (velocities), or the last command (positions). A command
+    holds until the next; one that is older than max_age_ms at the tick no longer counts."""
     relative_to: Literal["nothing", "state"] = "nothing"
     """state: the command less the state value of the same name at t, as for targets of joints."""
 

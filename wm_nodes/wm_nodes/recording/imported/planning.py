@@ -72,7 +72,7 @@ class Tally:
     gaps: dict[str, tuple[float, str]] = field(default_factory=dict)
     """Largest distance of two samples within a span, s, and where, by place."""
     commanded: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Least and largest command, by the action's name."""
+    """Least and largest command of a step, by the action's name."""
     beyond: Counter[str] = field(default_factory=Counter)
     """Steps with a command beyond the limits, by the action's name."""
     steps: int = 0
@@ -201,14 +201,14 @@ class Planner:
     def _command(self, stream: Stream, ticks: Times) -> tuple[NDArray[np.float64], BoolArray]:
         """(K, D) what was commanded from each tick to the next, and (K,) whether anything was."""
         assert isinstance(stream.source, Commands)
-        from_, to = (np.searchsorted(stream.times, ticks + later) for later in (0, self.contract.period_ns))
-        last = np.maximum(to - 1, 0)
-        values = stream.values[last]
-        if stream.source.resample == "mean":
-            sums = np.concatenate([np.zeros((1, values.shape[1])), stream.values.cumsum(0)])
-            several = to - from_ > 1
-            values[several] = (sums[to] - sums[from_])[several] / (to - from_)[several, None]
-        return values, (to > from_) | self._is_fresh(stream, ticks)
+        times, ends, holds = stream.times, ticks + self.contract.period_ns, self._is_fresh(stream, ticks)
+        first, last = np.searchsorted(times, ticks), np.searchsorted(times, ends) - 1
+        has = holds | (last >= first)
+        if stream.source.resample == "last":
+            return stream.values[np.maximum(last, 0)], has
+        begins = np.where(holds, ticks, times[np.minimum(first, len(times) - 1)])
+        spent = np.maximum(ends - begins, 1)[:, None]
+        return (_integral(stream, ends) - _integral(stream, begins)) / spent, has
 
     def _commands(self, ticks: Times) -> tuple[NDArray[np.float64], BoolArray]:
         """(K, A) commands in their units, and (K,) whether there is one of every topic."""
@@ -281,6 +281,14 @@ class Planner:
             f"{self.contract.episodes.success.file} has no row for {self.name} at {middle_s:.1f} s, the middle of an "
             f"episode; add one: {','.join(LABEL_COLUMNS)}"
         )
+
+
+def _integral(stream: Stream, until: Times) -> NDArray[np.float64]:
+    """(K, D) values times ns, from the first sample until each time, while every sample holds until the next."""
+    steps = stream.values[:-1] * np.diff(stream.times)[:, None]
+    sums = np.concatenate([np.zeros((1, stream.values.shape[1])), steps.cumsum(0)])
+    newest = np.maximum(stream.newest(until), 0)
+    return np.asarray(sums[newest] + stream.values[newest] * (until - stream.times[newest])[:, None])
 
 
 def _stretches(joined: BoolArray) -> list[tuple[int, int]]:

@@ -79,7 +79,7 @@ class Survey:
         successes = sum(bool(episode.success[-1]) for episode in episodes)
         lines = [
             *_aligned([header, *rows]), "",
-            *_aligned([("command", "limits", "commanded", "steps beyond"), *commands]), "",
+            *_aligned([("command", "limits", "in the steps", "steps beyond"), *commands]), "",
             f"bags: {len(self.planned)}; episodes: {len(episodes)}, {successes} of them end in success; steps: "
             f"{tally.steps} of {contract.period_ns / 1e6:g} ms",
             *(f"left out: {count} steps {reason}" for reason, count in tally.lost.items() if count),
