@@ -185,7 +185,7 @@ class Planner:
             else:
                 seen &= has
             self.tally.missing[place] += int((~has).sum())
-            inside = stream.times[(stream.times > ticks[0]) & (stream.times < ticks[-1])]
+            inside = stream.times[slice(*np.searchsorted(stream.times, ticks[[0, -1]]))]
             times = np.concatenate([ticks[:1], inside, ticks[-1:]])
             largest = int(np.diff(times).argmax())
             gap_s = float(np.diff(times)[largest]) / NS_PER_S
@@ -208,7 +208,7 @@ class Planner:
             return stream.values[np.maximum(last, 0)], has
         begins = np.where(holds, ticks, times[np.minimum(first, len(times) - 1)])
         spent = np.maximum(ends - begins, 1)[:, None]
-        return (_integral(stream, ends) - _integral(stream, begins)) / spent, has
+        return (stream.integral(ends) - stream.integral(begins)) / spent, has
 
     def _commands(self, ticks: Times) -> tuple[NDArray[np.float64], BoolArray]:
         """(K, A) commands in their units, and (K,) whether there is one of every topic."""
@@ -281,14 +281,6 @@ class Planner:
             f"{self.contract.episodes.success.file} has no row for {self.name} at {middle_s:.1f} s, the middle of an "
             f"episode; add one: {','.join(LABEL_COLUMNS)}"
         )
-
-
-def _integral(stream: Stream, until: Times) -> NDArray[np.float64]:
-    """(K, D) values times ns, from the first sample until each time, while every sample holds until the next."""
-    steps = stream.values[:-1] * np.diff(stream.times)[:, None]
-    sums = np.concatenate([np.zeros((1, stream.values.shape[1])), steps.cumsum(0)])
-    newest = np.maximum(stream.newest(until), 0)
-    return np.asarray(sums[newest] + stream.values[newest] * (until - stream.times[newest])[:, None])
 
 
 def _stretches(joined: BoolArray) -> list[tuple[int, int]]:

@@ -5,6 +5,7 @@ Shapes: n samples of a topic, D values.
 
 from array import array
 from difflib import get_close_matches
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -101,6 +102,17 @@ class Stream:
     def newest(self, ticks: Times) -> Times:
         """(K,) the sample at or before each tick; -1: none."""
         return np.searchsorted(self.times, ticks, side="right") - 1
+
+    def integral(self, until: Times) -> NDArray[np.float64]:
+        """(K, D) values times ns, from the first sample until each time, while each sample holds until the next."""
+        newest = np.maximum(self.newest(until), 0)
+        return np.asarray(self._sums[newest] + self.values[newest] * (until - self.times[newest])[:, None])
+
+    @cached_property
+    def _sums(self) -> NDArray[np.float64]:
+        """(n, D), integral(times)."""
+        held = self.values[:-1] * np.diff(self.times)[:, None]
+        return np.concatenate([np.zeros((1, self.values.shape[1])), held.cumsum(0)])
 
     def problems(self, contract: Contract) -> list[str]:
         """What makes it useless, with the remedies."""
