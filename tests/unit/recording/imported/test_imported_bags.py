@@ -211,6 +211,13 @@ def test_a_stretch_with_a_gap_is_lost_and_counted_and_nothing_is_filled(tmp_path
     assert "left out: 5 steps in gaps and short stretches" in report.table()
 
 
+def test_episodes_of_which_a_command_is_too_old_are_left_out_and_its_topic_is_named(tmp_path: Path) -> None:
+    bag = Run(3).write(tmp_path / "bag")  # the gripper was commanded once, 2 s before the first episode
+    report = survey([bag], load_contract(contract_file(tmp_path / "contract.yaml", actions__1__max_age_ms=5000)))
+    assert len(report.episodes) == 1
+    assert "left out: 2 stretches without a command of actions.1" in report.table()
+
+
 def test_a_success_whose_end_lies_in_a_gap_is_no_success_and_counted(tmp_path: Path) -> None:
     messages = [each for each in stream(24) if each[1] != FRONT or each[0] < BEGIN_NS + 1900 * MS]
     (episode,) = one_topic(tmp_path, messages)

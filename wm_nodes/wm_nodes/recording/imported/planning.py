@@ -136,7 +136,8 @@ class Planner:
         commands, commanded = self._commands(ticks)
         moved = np.flatnonzero(commanded)
         if not len(moved):
-            tally.lost_episodes["without a command"] += 1
+            silent = [stream.place for stream in self._actions if not self._command(stream, ticks)[1].any()]
+            tally.lost_episodes[f"without a command of {' and '.join(silent) or 'all topics at once'}"] += 1
             return []
         first, end = moved[0], min(moved[-1] + 2, len(ticks))
         tally.lost["before the first command or after the last"] += len(ticks) - (end - first)
