@@ -115,21 +115,22 @@ def test_a_bag_that_was_split_into_files_gives_the_same_episodes(tmp_path: Path)
 
 
 def test_a_foreign_bag_becomes_a_world_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bags = [str(Run(3, seed=seed).write(tmp_path / f"run_{seed}")) for seed in range(2)]
+    bags = [str(Run(4, seed=seed).write(tmp_path / f"run_{seed}")) for seed in range(2)]
     out = tmp_path / "ours"
     assert main(["import", "rosbag", str(EXAMPLE), *bags, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert "bags: 2; episodes: 6, 4 of them end in success; steps: 120 of 100 ms" in printed
+    assert "bags: 2; episodes: 8, 4 of them end in success; steps: 160 of 100 ms" in printed
     spec, episodes = read_spec(out), list(read_episodes(out))
     assert (spec.cameras, spec.height, spec.width, spec.source) == (("front", "wrist"), 64, 128, SOURCE_REAL)
     assert spec.state_names == ("position.j1", "position.j2", "gripper.width") and spec.measured == (0, 1, 2)
     assert spec.action_scale == pytest.approx((0.1, 0.1, 0.04)) and spec.control_period_s == 0.1
+    assert spec.max_episode_steps == 20
     assert {episode.instruction for episode in episodes} == {"pick up the cup"}
     with Bag(out) as bag:
         assert "lab/my_arm" in bag.custom["wm.contract_yaml"] and "images.front" in bag.custom["wm.import_table"]
     arrays = stack_episodes(episodes, (spec.task,), num_steps=spec.max_episode_steps)
-    assert arrays.images.shape == (6, 21, 64, 128, 3)
-    assert arrays.success[:, -1, 0].tolist() == [True, False, True] * 2
+    assert arrays.images.shape == (8, 21, 64, 128, 3)
+    assert arrays.success[:, -1, 0].tolist() == [True, False] * 4
     torch.set_num_threads(1)
     folder = model_from_recordings([out], load_config("smoke", TINY), tmp_path / "model")
     models = load_model_folder(folder)
@@ -231,14 +232,6 @@ def test_what_comes_before_the_first_command_and_after_the_last_is_no_part_of_an
     assert episode.images[:, 0, 0, 0].tolist() == list(range(7)) and episode.success[-1]
     report = survey([tmp_path / "bag"], load_contract(tmp_path / "contract.yaml"))
     assert "left out: 5 steps before the first command or after the last" in report.table()
-
-
-def test_a_long_episode_is_cut_into_parts_and_no_step_is_lost(tmp_path: Path) -> None:
-    episodes = one_topic(tmp_path, stream(12), episodes__max_steps=4)
-    assert [episode.num_steps for episode in episodes] == [4, 4, 3]
-    assert [episode.images[0, 0, 0, 0] for episode in episodes] == [0, 4, 8]
-    assert [bool(episode.success[-1]) for episode in episodes] == [False, False, True]
-    assert read_spec(tmp_path / "out").max_episode_steps == 4
 
 
 def test_episodes_lie_between_silences_of_the_commands(tmp_path: Path) -> None:

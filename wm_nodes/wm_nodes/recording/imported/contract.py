@@ -152,8 +152,6 @@ class EpisodeRules(SettingsSection):
     """Who acted, as our bags call it."""
     min_steps: PositiveInt = 4
     """What is shorter is left out, and counted."""
-    max_steps: PositiveInt = 256
-    """What is longer is cut into parts of about equal length, nothing left out."""
 
 
 class Contract(SettingsSection):

@@ -161,14 +161,13 @@ class Planner:
                 tally.lost_episodes[f"shorter than min_steps {contract.episodes.min_steps}"] += 1
                 continue
             covered += steps
-            for part in np.array_split(np.arange(start, start + steps), -(-steps // contract.episodes.max_steps)):
-                rows, frames = slice(part[0], part[-1] + 1), slice(part[0], part[-1] + 2)
-                self._count_commands(actions[rows], commands[rows])
-                planned.append(PlannedEpisode(
-                    ticks[frames], pictures[frames], states[frames].astype(np.float32),
-                    np.clip(actions[rows], -1, 1).astype(np.float32), success[frames], self._rewards(ticks[frames][1:]),
-                    instruction,
-                ))
+            rows, frames = slice(start, start + steps), slice(start, start + steps + 1)
+            self._count_commands(actions[rows], commands[rows])
+            planned.append(PlannedEpisode(
+                ticks[frames], pictures[frames], states[frames].astype(np.float32),
+                np.clip(actions[rows], -1, 1).astype(np.float32), success[frames], self._rewards(ticks[frames][1:]),
+                instruction,
+            ))
         tally.lost["in gaps and short stretches"] += len(joined) - covered
         if success[-1] and not (planned and planned[-1].ticks[-1] == ticks[-1]):
             tally.lost_episodes["with a success at the end"] += 1
