@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from foreign_robot import (
+    BEGIN_NS,
     EXAMPLE,
     FRONT,
     JOINTS,
@@ -137,6 +138,8 @@ BAGS: dict[str, tuple[Change | None, dict[str, Any], str]] = {
                         "has stamps that fall by 1.1 s; set its timeline to receive"),
     "clocks apart": (stamped(FRONT, lambda now: now - 900 * MS), {}, "lie 905 ms apart, and max_clock_offset_ms is "
                      "500; set timeline to receive, or synchronise"),
+    "a clock that was set": (stamped(JOINTS, lambda now: now - BEGIN_NS * (now < BEGIN_NS + 2000 * MS) + 1),
+                             {"episodes__split": {"per": "bag"}}, "lasts 472222 h: a clock was set while"),
     "header of none": (None, {"observations__state__1__timeline": "header"},
                        "std_msgs/msg/Float64MultiArray has no header"),
     "beyond": (None, {"actions__0__low": [-0.05, -0.1]}, "commands leave the limits: twist.linear.x from -0.06"),

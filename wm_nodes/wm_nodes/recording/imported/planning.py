@@ -22,6 +22,8 @@ from wm_nodes.recording.imported.streams import Stream, Times
 from wm_nodes.recording.messages import NS_PER_S
 
 NEVER_NS = 2**63 - 1
+LONGEST_S = 86_400
+"""Of an episode."""
 LABEL_COLUMNS = ("bag", "start_s", "end_s", "success")
 
 
@@ -132,6 +134,9 @@ class Planner:
 
     def _of_span(self, span: Span) -> list[PlannedEpisode]:
         contract, tally = self.contract, self.tally
+        if (lasts_s := (span.end_ns - span.start_ns) / NS_PER_S) > LONGEST_S:
+            raise BagError(f"an episode in {self.name} lasts {lasts_s / 3600:.0f} h: a clock was set while it was "
+                           "recorded; set timeline to the other clock, or leave this bag out")
         ticks = np.arange(span.start_ns, span.end_ns + 1, contract.period_ns, dtype=np.int64)
         commands, commanded = self._commands(ticks)
         moved = np.flatnonzero(commanded)
