@@ -114,6 +114,7 @@ def test_a_bag_that_was_split_into_files_gives_the_same_episodes(tmp_path: Path)
         np.testing.assert_array_equal(one.states, same.states)
 
 
+@pytest.mark.slow
 def test_a_foreign_bag_becomes_a_world_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bags = [str(Run(4, seed=seed).write(tmp_path / f"run_{seed}")) for seed in range(2)]
     out = tmp_path / "ours"
