@@ -1,6 +1,7 @@
 """wm train-model: a stranger's bag becomes a model that is judged, with what it says on the way."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,11 @@ def test_a_model_is_trained_judged_and_kept_and_the_folder_alone_goes_on(
     assert main(["train-model", "--out", str(tmp_path / "out")]) == code
     assert f"acceptance {verdict['outcome']}" in said(capsys)[0]
     assert {path.name: path.read_bytes() for path in model.iterdir()} == kept
+    shutil.rmtree(model)
+    assert main(["train-model", "--out", str(tmp_path / "out")]) == code
+    assert {path.name: path.read_bytes() for path in model.glob("*.safetensors")} == {
+        name: data for name, data in kept.items() if name.endswith(".safetensors")
+    }
     assert train("--bags", bag.parent, "--out", tmp_path / "out") == 2
     assert "was begun with other options: --bags is" in said(capsys)[1]
 

@@ -1,16 +1,20 @@
 """Recordings as training data: what is used and held out, what is lost, and why bags are refused."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from recording_graph import NUM_ENVS, PERIOD_NS, Graph
+from recording_graph import write as write_live
 from recording_samples import make_episode, make_spec
 
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Episode
-from wm_nodes.recording import BagError, EpisodeBagWriter
+from wm_nodes.recording import BagError, EpisodeBagWriter, topics
+from wm_nodes.recording import messages as m
 from wm_nodes.recording.training_data import PART_STEPS, TrainingData, read_training_data
 
 SPEC = make_spec(task="stir_the_pot", ground_truth_names=())
@@ -75,6 +79,26 @@ def test_a_long_episode_is_cut_in_parts_that_hold_every_step_and_stay_on_one_sid
 def test_several_instructions_are_said_to_be_unread(tmp_path: Path) -> None:
     bag = write(tmp_path / "bag", episodes(change=lambda e: replace(e, instruction=f"stir pot {e.episode_id % 2}")))
     assert any(line.startswith("2 instructions, which this model does not read") for line in read(bag).summary)
+
+
+def test_what_a_live_recording_lost_is_said_with_its_reason_and_success_is_the_flag_without_ground_truth(
+    tmp_path: Path
+) -> None:
+    graph = Graph(make_spec(num_envs=NUM_ENVS, ground_truth_names=()))
+    graph.rollout(1, 40)
+    bag = write_live(
+        tmp_path / "bag", graph, drop=lambda topic, message: (
+            (topic is topics.IMAGES and m.stamp_ns(message.header.stamp) == 4 * PERIOD_NS)
+            or (topic is topics.TRANSITION and message.seq == 30)
+        ),
+    )
+    data = read(bag)
+    assert data.tasks == ("push_cube",) and data.training.success.any()
+    used, lost = " ".join(data.summary), data.summary[-3:]
+    assert re.search(r"used: (\d+) episodes", used)[1] == str(len(data.training) + len(data.heldout))  # type: ignore[index]
+    assert lost[0].endswith("cut off by the start or end of the recording")
+    assert "incomplete episodes (episode" in lost[1] and "the image at stamp 400000000 is missing" in lost[1]
+    assert lost[2] == f"lost from {bag}: 1 message of wm/env/transition that the recorder did not get"
 
 
 def refused(*bags: Path) -> str:

@@ -68,7 +68,8 @@ def read_training_data(bags: Sequence[Path], *, num_heldout: int, seed: int) -> 
         raise BagError(f"{won.sum()} of {len(won)} episodes in {named} succeed, and {MIN_SUCCESSES} are needed, to "
                        "learn when the task is done and to judge that; record successes, and set the success flag of "
                        "wm/env/transition (success_probability) where the task is done")
-    tasks, steps = model_tasks(spec.task), min(spec.max_episode_steps or PART_STEPS, PART_STEPS)
+    tasks = model_tasks(spec.task) if spec.ground_truth_names else (spec.task,)
+    steps = min(spec.max_episode_steps or PART_STEPS, PART_STEPS)
     parts = [[*_parts(episode, steps)] for episode in episodes]
     held = _heldout(won, num_heldout, seed)
     training, heldout = (
@@ -118,8 +119,9 @@ def _read(bags: Sequence[Path], spec: EnvironmentSpec) -> tuple[list[Episode], l
 
 
 def _succeeds(episode: Episode, task: str) -> bool:
-    """By the task's rule, else by the recorded flag."""
-    done = success(task, episode.ground_truth) if has_rule(task) else episode.success
+    """By the task's rule where there is ground truth, else by the recorded flag."""
+    by_rule = has_rule(task) and episode.ground_truth.shape[1] > 0
+    done = success(task, episode.ground_truth) if by_rule else episode.success
     return bool(done[1:].any())
 
 
