@@ -194,7 +194,9 @@ def test_what_a_models_manifest_says_stands_in_for_a_measurement() -> None:
 
 
 BY_PICTURES = {
-    "done_stir_precision": 0.9, "done_stir_recall": 0.8, "done_stir_auc": 0.87, "done_stir_real_rate": 0.4,
+    "done_stir_precision": 0.9, "done_stir_precision_low": 0.7, "done_stir_precision_high": 0.95,
+    "done_stir_recall": 0.8, "done_stir_recall_low": 0.6, "done_stir_recall_high": 0.9,
+    "done_stir_auc": 0.87, "done_stir_real_rate": 0.4,
     "feature_episodes_h08": 20.0, "feature_episodes_h16": 9.0,
     "feature_ratio_h08": 0.5, "feature_ratio_low_h08": 0.4, "feature_ratio_high_h08": 0.6,
     "other_actions_h08": 1.3, "other_actions_low_h08": 1.1, "other_actions_high_h08": 1.5,
@@ -226,7 +228,10 @@ def test_a_model_without_positions_passes_by_its_done_signal_its_pictures_and_it
         ({"feature_ratio_h08": np.nan}, "failed", "feature distance / copying, step 8"),
         ({"other_actions_h08": 1.0, "other_actions_low_h08": 1.0}, "failed", "other / recorded actions, step 8"),
         ({"other_actions_low_h08": 0.9}, "undecided", "other / recorded actions, step 8"),
-        ({"done_stir_recall": np.nan}, "failed", "done recall on rollouts"),
+        ({"done_stir_recall": 0.3, "done_stir_recall_high": 0.5}, "failed", "done recall on rollouts"),
+        ({"done_stir_recall": 0.3, "done_stir_recall_high": 0.7}, "undecided", "done recall on rollouts"),
+        ({"done_stir_precision": 0.9, "done_stir_precision_low": 0.5}, "undecided", "done precision on rollouts"),
+        ({"done_stir_precision": np.nan}, "undecided", "done precision on rollouts"),
     ],
 )
 def test_without_positions_each_criterion_alone_keeps_a_model_back(

@@ -50,6 +50,9 @@ from wm_nodes.world_model.validation.acceptance import model_metrics
 from wm_nodes.world_model.validation.controllability import controllability_metrics
 from wm_nodes.world_model.validation.goals import goal_metrics
 
+FEW_STEPS = 16
+"""Of one iteration of the action model: where recorded episodes are longer, their user hears of parts."""
+
 
 def load_arrays(bags: Iterable[Path], config: RunConfig) -> EpisodeArrays:
     """Stack every episode of the bags, labelled for all tasks of the scene."""
@@ -168,6 +171,8 @@ def model_from_data(
     probe: PositionProbe | None = None
     if tokenizer.num_positions:
         probe, _ = train_position_probe(data.training, config, config.seed, run_dir)
+    if not config.world_model.part_steps and (steps := data.training.num_steps) > FEW_STEPS:
+        say(f"every iteration rolls {steps} steps out; --world_model.part_steps {FEW_STEPS} takes random ones, faster")
     say(f"action model with {config.world_model.num_done_heads} done heads, {config.world_model.num_iterations} "
         "iterations")
     with explain_memory(device, world_model__batch_size=config.world_model.batch_size):

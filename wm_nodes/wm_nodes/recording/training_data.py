@@ -69,12 +69,13 @@ def read_training_data(bags: Sequence[Path], *, num_heldout: int, seed: int) -> 
                        "learn when the task is done and to judge that; record successes, and set the success flag of "
                        "wm/env/transition (success_probability) where the task is done")
     tasks = model_tasks(spec.task) if spec.ground_truth_names else (spec.task,)
-    steps = min(spec.max_episode_steps or PART_STEPS, PART_STEPS)
-    parts = [[*_parts(episode, steps)] for episode in episodes]
+    most = min(spec.max_episode_steps or PART_STEPS, PART_STEPS)
+    parts = [[*_parts(episode, most)] for episode in episodes]
+    longest = max(part.num_steps for of_one in parts for part in of_one)
     held = _heldout(won, num_heldout, seed)
     training, heldout = (
         stack_episodes([part for of_one, its in zip(parts, held) if its == is_held for part in of_one], tasks,
-                       num_steps=steps)
+                       num_steps=most if spec.ground_truth_names else longest)
         for is_held in (False, True)
     )
     chosen = tuple(episode for episode, its in zip(episodes, held) if not its)

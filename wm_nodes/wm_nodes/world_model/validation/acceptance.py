@@ -193,7 +193,10 @@ def apply_criteria(
         value, interval = _mean_of_parts(metrics, parts_of(task), kind)
         name = f"done {kind} on rollouts" + (", mean of the tasks" if len(parts_of(task)) > 1 else "")
         outcome: Outcome = "passed" if value >= threshold else "failed"
-        criteria.append(Criterion(name, value, threshold, ">=", outcome, remedy, interval))
+        rule = ">="
+        if not has_positions:  # a stranger's recordings may be few
+            outcome, rule = _of_share(value, *(interval or (0.0, 1.0)), threshold, limits.success_margin)
+        criteria.append(Criterion(name, value, threshold, rule, outcome, remedy, interval))
     if not has_positions:
         of_pictures, more = _picture_criteria(metrics, config, num_steps)
         criteria, notes = criteria + of_pictures, notes + more
@@ -336,17 +339,22 @@ def _agreement(imagined: tuple[int, int], real: tuple[int, int], margin: float) 
 
 
 def _of_clone(kind: str, right: BoolArray, limit: float, config: RunConfig, remedy: str) -> Criterion:
-    """Fails where even the upper end of the interval misses the limit, passes where the lower end is within
-    acceptance.success_margin of it."""
+    """See _of_share."""
     value, low, high = wilson_of_share(right)
-    near = limit - config.acceptance.success_margin
+    outcome, rule = _of_share(value, low, high, limit, config.acceptance.success_margin)
+    return Criterion(f"done {kind}, cloned policy ({len(right)})", value, limit, rule, outcome, remedy, (low, high))
+
+
+def _of_share(value: float, low: float, high: float, limit: float, margin: float) -> tuple[Outcome, str]:
+    """Outcome and rule of a share with its interval: it fails where even the upper end misses the limit, and passes
+    where the lower end is within the margin of it."""
+    near = limit - margin
     outcome: Outcome = "undecided"
     if high < limit:
         outcome = "failed"
     elif value >= limit and low >= near:
         outcome = "passed"
-    rule = f"interval above {near:.2f}, value >="
-    return Criterion(f"done {kind}, cloned policy ({len(right)})", value, limit, rule, outcome, remedy, (low, high))
+    return outcome, f"interval above {near:.2f}, value >="
 
 
 def _goals(found: Mapping[str, float], config: RunConfig, part: str) -> list[Criterion]:
