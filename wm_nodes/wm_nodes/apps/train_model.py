@@ -92,7 +92,7 @@ def opened(arguments: argparse.Namespace) -> AbstractContextManager[tuple[RunCon
         bags = [Path(bag) for bag in arguments.bags]
         if arguments.task:
             _check_task(arguments.task, bags)
-        is_made = arguments.run_dir and (arguments.run_dir / MODEL / MANIFEST).exists()
+        is_made = arguments.run_dir and (arguments.run_dir.expanduser() / MODEL / MANIFEST).exists()
         arguments.data = None if is_made else read_recordings(bags, config)
 
     starter = Starter("train-model", _load, FIXED, {}, options.OPTION_OF, prefix="--")
