@@ -6,7 +6,7 @@ python3 launch_scripts/run_tests.py --fast     # without the tests marked slow o
 python3 launch_scripts/run_tests.py tests/unit -k setup    # other arguments go to pytest; the checks still run
 python3 launch_scripts/run_tests.py --device cuda          # only the tests of a CUDA device, on the GPU that is here
 
-Tests run three at a time and those with deadlines after them, four at a time: graphs wait more than they compute.
+Tests run three at a time, since graphs wait more than they compute, and those with deadlines after the others.
 A graph test that fails so, or that hangs inside DDS, is run once more by itself, which the output says: deadlines are
 promised where nothing else keeps the machine busy.
 """
@@ -59,7 +59,7 @@ def _every_test(fast):
     forget()
     codes = [_pytest(["-m", " and ".join(["not alone", *fast]), *BY_FILE, *LONG_FIRST])]
     if not fast:
-        codes.append(_pytest(["-m", "alone", *BY_FILE, "-n4", *WITH_DEADLINES]))
+        codes.append(_pytest(["-m", "alone", *BY_FILE, *WITH_DEADLINES]))
     return repeated() if max(codes) == 1 else max(codes)
 
 

@@ -37,4 +37,4 @@ def launched(scenario: str, given: Sequence[str], log: Path) -> Iterator[None]:
 def train_policy(arguments: list[str], domain: int) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "COLUMNS": "160"}
     command = [sys.executable, "-c", TRAIN_POLICY, "--domain-id", str(domain), *arguments]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
+    return subprocess.run(command, env=environment, capture_output=True, encoding="utf-8", timeout=600, check=False)

@@ -96,7 +96,7 @@ def test_evaluation_episodes_are_recorded_and_a_killed_simulator_or_evaluation_n
             lost = probe.finish(running, within(8.0))  # before its step_timeout_s: it hears /wm/sim's heartbeats
             assert lost.termination_reason == Evaluate.Result.PEER_LOST and "environment" in lost.message
             lost = evaluate(probe, 1)
-            assert lost.termination_reason == Evaluate.Result.PEER_LOST and "environment" in lost.message
+            assert lost.termination_reason == Evaluate.Result.PEER_LOST and "sim/env/get_spec" in lost.message
         else:
             probe.wait_for_loss("/wm/recorder", "/wm/evaluation")
         probe.diagnostics.pop(name, None)

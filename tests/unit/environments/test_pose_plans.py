@@ -32,7 +32,9 @@ def waypoints(truth):
     return [waypoint((0.0, 0.1), 0.1, 0.0, 1.0), waypoint((2.0, 0.0), 0.1, 0.0, 1.0)]
 
 
-TASK = replace(pick_place.TASK, waypoints=waypoints, script=scripted(waypoints, speed=0.8))
+TASK = replace(pick_place.TASK, simulator=replace(
+    pick_place.TASK.simulator, waypoints=waypoints, script=scripted(waypoints, speed=0.8)
+))
 '''
 START = waypoint((0.0, 0.0), 0.17, 0.0, OPEN)
 PICK = [

@@ -206,7 +206,7 @@ class ImaginedEpisodes:
 
 def put_where(mask_N: Tensor, now: Tensor, new: Tensor) -> None:
     """Put the rows of `new` where the mask is True into `now`, in place; both (N, ...)."""
-    now.copy_(torch.where(mask_N.view(-1, *[1] * (now.ndim - 1)), new, now))
+    torch.where(mask_N.view(-1, *[1] * (now.ndim - 1)), new, now, out=now)
 
 
 def imagined_spec(spec: EnvironmentSpec, env_id: str, sha256: str, num_envs: int) -> EnvironmentSpec:
