@@ -226,7 +226,8 @@ def test_a_model_without_positions_passes_by_its_done_signal_its_pictures_and_it
     [
         ({"feature_ratio_h08": 0.9}, "failed", "feature distance / copying, step 8"),
         ({"feature_ratio_h08": np.nan}, "failed", "feature distance / copying, step 8"),
-        ({"other_actions_h08": 1.0, "other_actions_low_h08": 1.0}, "failed", "other / recorded actions, step 8"),
+        ({"other_actions_h08": 1.0, "other_actions_low_h08": 1.0, "other_actions_high_h08": 1.01}, "failed",
+         "other / recorded actions, step 8"),
         ({"other_actions_low_h08": 0.9}, "undecided", "other / recorded actions, step 8"),
         ({"done_stir_recall": 0.3, "done_stir_recall_high": 0.5}, "failed", "done recall on rollouts"),
         ({"done_stir_recall": 0.3, "done_stir_recall_high": 0.7}, "undecided", "done recall on rollouts"),

@@ -195,7 +195,7 @@ def apply_criteria(
         outcome: Outcome = "passed" if value >= threshold else "failed"
         rule = ">="
         if not has_positions:  # a stranger's recordings may be few
-            outcome, rule = _of_share(value, *(interval or (0.0, 1.0)), threshold, limits.success_margin)
+            outcome, rule = _of_interval(value, *(interval or (0.0, 1.0)), threshold, limits.success_margin)
         criteria.append(Criterion(name, value, threshold, rule, outcome, remedy, interval))
     if not has_positions:
         of_pictures, more = _picture_criteria(metrics, config, num_steps)
@@ -222,9 +222,10 @@ def _picture_criteria(
     criteria = [_below(name, ratio, limit, _interval(*ends), MORE_RECORDED)]
     ratio, low, high = (_at(metrics, f"other_actions{end}", step) for end in ("", "_low", "_high"))
     if math.isfinite(low):
-        outcome: Outcome = "passed" if low > 1 else "undecided" if ratio > 1 else "failed"
+        limit = config.acceptance.other_actions_ratio
+        outcome, rule = _of_interval(ratio, low, high, limit, limit - 1)
         name = f"feature distance, other / recorded actions, step {step}"
-        criteria.append(Criterion(name, ratio, 1.0, "interval above", outcome, OTHER_ACTIONS, (low, high)))
+        criteria.append(Criterion(name, ratio, limit, rule, outcome, OTHER_ACTIONS, (low, high)))
     else:
         notes.append("Sensitivity to actions was not judged: no two held-out episodes differ in their actions.")
     notes.append("Features are the tokenizer's: what it does not encode, e.g. a thing of few pixels, they do not see.")
@@ -339,14 +340,14 @@ def _agreement(imagined: tuple[int, int], real: tuple[int, int], margin: float) 
 
 
 def _of_clone(kind: str, right: BoolArray, limit: float, config: RunConfig, remedy: str) -> Criterion:
-    """See _of_share."""
+    """See _of_interval."""
     value, low, high = wilson_of_share(right)
-    outcome, rule = _of_share(value, low, high, limit, config.acceptance.success_margin)
+    outcome, rule = _of_interval(value, low, high, limit, config.acceptance.success_margin)
     return Criterion(f"done {kind}, cloned policy ({len(right)})", value, limit, rule, outcome, remedy, (low, high))
 
 
-def _of_share(value: float, low: float, high: float, limit: float, margin: float) -> tuple[Outcome, str]:
-    """Outcome and rule of a share with its interval: it fails where even the upper end misses the limit, and passes
+def _of_interval(value: float, low: float, high: float, limit: float, margin: float) -> tuple[Outcome, str]:
+    """Outcome and rule of a value with its interval: it fails where even the upper end misses the limit, and passes
     where the lower end is within the margin of it."""
     near = limit - margin
     outcome: Outcome = "undecided"
