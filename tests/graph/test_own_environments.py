@@ -15,14 +15,13 @@ from graph.launched import train_policy
 from examples import own_environment
 from wm_msgs.action import Rollout, Train
 from wm_msgs.srv import StopRecording
-from wm_nodes.apps.cli import main
+from wm_nodes.apps.cli import DONE, NOT_ACCEPTED, main
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.specs import SpecMismatch, agree
 from wm_nodes.environments.registry import configured_spec
 from wm_nodes.policy_rl.factories import UNTRAINED, make_imagined_environment, make_policy
 from wm_nodes.policy_rl.initial_policy import STARTS
-from wm_nodes.policy_rl.pretraining import model_from_recordings
 from wm_nodes.recording import read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.reports.summary import read_summary
@@ -76,7 +75,13 @@ def bag(config: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 
 @pytest.fixture(scope="module")
 def model_dir(bag: Path, config: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return model_from_recordings([bag], config, tmp_path_factory.mktemp("trained"))
+    """What `wm train-model` makes of the recording."""
+    folder = tmp_path_factory.mktemp("trained")
+    preset = folder / "own.yaml"
+    preset.write_text(dump_config(config), encoding="utf-8")
+    given = ["--bags", str(bag), "--preset", str(preset), "--out", str(folder / "out")]
+    assert main(["train-model", *given]) in (DONE, NOT_ACCEPTED)
+    return folder / "out" / "model"
 
 
 def test_the_recording_holds_the_spec_and_the_success_that_the_environment_says(bag: Path, config: RunConfig) -> None:
@@ -123,7 +128,9 @@ def test_acceptance_judges_the_done_signal_and_says_that_it_cannot_judge_positio
     models, spec = load_model_folder(model_dir), read_spec(bag)
     heldout = stack_episodes(read_episodes(bag), models.tasks, num_steps=spec.max_episode_steps)
     report = accept_world_model(models, heldout, config)
-    assert [row.name for row in report.criteria] == ["done precision on rollouts", "done recall on rollouts"]
+    names = [row.name.split(", step")[0] for row in report.criteria]
+    assert names == ["done precision on rollouts", "done recall on rollouts", "feature distance / copying",
+                     "feature distance, other / recorded actions"]
     assert report.task == spec.task and "Positions were not judged" in report.notes[0]
 
 
@@ -159,8 +166,8 @@ def test_train_policy_needs_no_task_and_says_where_nothing_real_was_measured(
     assert done.returncode == 0, done.stdout + done.stderr
     summary = read_summary(tmp_path / "run")
     assert summary["task"] == "touch_the_post" and summary["imagined_after"]["episodes"] == 32
-    criteria = [row["name"] for row in summary["acceptance"]["criteria"]]
-    assert criteria[:2] == ["done precision on rollouts", "done recall on rollouts"]
+    when_made = json.loads((model_dir / "acceptance.json").read_text())["criteria"]
+    assert len(when_made) == 4 and summary["acceptance"]["criteria"][:4] == when_made
     report = (tmp_path / "run" / "report.html").read_text()
     assert ("Nothing real was measured" in report) is (measured_in == "none")
     assert (summary["real_after"] or {"episodes": None})["episodes"] == (None if measured_in == "none" else 4)

@@ -15,6 +15,7 @@ from wm_nodes.apps import cli
 from wm_nodes.core.errors import ModelNotAcceptedError, RunError
 
 OPTIONS = {
+    "train-model": "--bags --task --out --run-dir --preset --SECTION.KEY --device --seed",
     "train-policy": "--preset --SECTION.KEY --device --task --seed --run-dir --model-dir --from-scratch --force "
     "--environment --video-model --reward --judge --judge-model --judge-key-env --rubric --compose "
     "--domain-id --verbose",

@@ -193,6 +193,67 @@ def test_what_a_models_manifest_says_stands_in_for_a_measurement() -> None:
     assert accepted_when_made({}, config).startswith("not judged: the model's manifest holds no metrics")
 
 
+BY_PICTURES = {
+    "done_stir_precision": 0.9, "done_stir_precision_low": 0.7, "done_stir_precision_high": 0.95,
+    "done_stir_recall": 0.8, "done_stir_recall_low": 0.6, "done_stir_recall_high": 0.9,
+    "done_stir_auc": 0.87, "done_stir_real_rate": 0.4,
+    "feature_episodes_h08": 20.0, "feature_episodes_h16": 9.0,
+    "feature_ratio_h08": 0.5, "feature_ratio_low_h08": 0.4, "feature_ratio_high_h08": 0.6,
+    "other_actions_h08": 1.3, "other_actions_low_h08": 1.1, "other_actions_high_h08": 1.5,
+}
+
+
+def judged_by_pictures(**changes: float) -> AcceptanceReport:
+    config = settings().model_copy(update={"task": "stir"})
+    return judged(BY_PICTURES | changes, config, None, None)
+
+
+def test_a_model_without_positions_passes_by_its_done_signal_its_pictures_and_its_actions() -> None:
+    report = judged_by_pictures()
+    assert report.passed and [(row.name, row.value) for row in report.criteria] == [
+        ("done precision on rollouts", 0.9), ("done recall on rollouts", 0.8),
+        ("feature distance / copying, step 8", 0.5), ("feature distance, other / recorded actions, step 8", 1.3),
+    ]
+    notes = " ".join(report.notes)
+    for words in ("Positions were not judged", "AUC of the done signal: 0.87, chance is 0.5",
+                  "up to step 8, which half of the held-out episodes reach; imagined episodes have up to 16",
+                  "they do not see", "Agreement of imagined and real success was not judged"):
+        assert words in notes
+
+
+@pytest.mark.parametrize(
+    ("changes", "outcome", "due_to"),
+    [
+        ({"feature_ratio_h08": 0.9}, "failed", "feature distance / copying, step 8"),
+        ({"feature_ratio_h08": np.nan}, "failed", "feature distance / copying, step 8"),
+        ({"other_actions_h08": 1.0, "other_actions_low_h08": 1.0, "other_actions_high_h08": 1.01}, "failed",
+         "other / recorded actions, step 8"),
+        ({"other_actions_low_h08": 0.9}, "undecided", "other / recorded actions, step 8"),
+        ({"done_stir_recall": 0.3, "done_stir_recall_high": 0.5}, "failed", "done recall on rollouts"),
+        ({"done_stir_recall": 0.3, "done_stir_recall_high": 0.7}, "undecided", "done recall on rollouts"),
+        ({"done_stir_precision": 0.9, "done_stir_precision_low": 0.5}, "undecided", "done precision on rollouts"),
+        ({"done_stir_precision": np.nan}, "undecided", "done precision on rollouts"),
+    ],
+)
+def test_without_positions_each_criterion_alone_keeps_a_model_back(
+    changes: dict[str, float], outcome: str, due_to: str
+) -> None:
+    report = judged_by_pictures(**changes)
+    (name,) = report.failed or report.undecided
+    assert report.outcome == outcome and name.endswith(due_to)
+
+
+def test_what_recordings_cannot_show_is_named_and_not_judged() -> None:
+    report = judged_by_pictures(
+        done_stir_real_rate=1.0, done_stir_auc=np.nan, other_actions_low_h08=np.nan, other_actions_h08=np.nan
+    )
+    assert [row.name for row in report.criteria] == ["done recall on rollouts", "feature distance / copying, step 8"]
+    notes = " ".join(report.notes)
+    for words in ("Precision of the done signal was not judged: every held-out episode succeeds",
+                  "AUC of the done signal was not judged", "Sensitivity to actions was not judged"):
+        assert words in notes
+
+
 @pytest.fixture(scope="module")
 def heldout() -> EpisodeArrays:
     return stack_episodes((episode(seed) for seed in range(6)), TASKS, success)

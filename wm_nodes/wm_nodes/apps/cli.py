@@ -37,6 +37,7 @@ NO_BENCHMARKS = "the benchmarks come with the repository and are not installed; 
 
 GROUPS = {
     "train": {
+        "train-model": "a world model on recordings of your own, judged on some of them",
         "train-policy": "a policy in the world model, measured in the simulator",
         "train-video-model": "the video world model by GRPO on its own clips",
         "check-video-model": "whether a video model is fit to be trained so",

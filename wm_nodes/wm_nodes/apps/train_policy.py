@@ -273,8 +273,9 @@ def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, r
     path.write_text(json.dumps(report.to_dict(), indent=1), encoding="utf-8")
     console.print(report.table())
     if report.failed and not force:
+        again = "--from-scratch --preset cpu_full" if config.task else "wm train-model"
         raise ModelNotAcceptedError(
             f"{', '.join(report.failed)} failed (numbers in {path}): the policy would learn to exploit the model. "
-            "Train the model longer or on more data (--from-scratch --preset cpu_full), or go on with --force"
+            f"Train the model longer or on more data ({again}), or go on with --force"
         )
     job.stage(f"acceptance {report.words}" + (", going on because of --force" if report.failed else ""))

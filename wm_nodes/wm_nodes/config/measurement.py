@@ -34,6 +34,11 @@ class AcceptanceConfig(SettingsSection):
     """Full-horizon object error must be below this share of the error of copying the first frame."""
     tool_error_ratio: PositiveFloat
     """The same of the tool's error."""
+    feature_error_ratio: PositiveFloat = 1.0
+    """Without ground truth: the distance of imagined to recorded pictures, by the tokenizer's features, must be below
+    this share of that of the first frame."""
+    other_actions_ratio: PositiveFloat = 1.0
+    """The same distance under another episode's actions must be at least so many times that under the recorded ones."""
     done_precision: Fraction
     """Least precision of the done signal."""
     done_recall: Fraction

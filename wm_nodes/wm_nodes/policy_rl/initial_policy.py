@@ -65,6 +65,14 @@ def write_starts(
                 break
             counts[episode.task] += 1
             chosen.append(episode)
+    return write_episode_starts(chosen, path, tasks=tasks, frames=frames, seed=seed)
+
+
+def write_episode_starts(
+    chosen: Sequence[Episode], path: Path, *, tasks: Sequence[str] = (), frames: Literal["first", "any"] = "first",
+    seed: int = 0,
+) -> int:
+    """write_starts of these episodes."""
     stream = numpy_stream(seed, "start_frames")
     rows = [int(stream.integers(frames_before_success(e, tasks))) if frames == "any" else 0 for e in chosen]
     tensors = {

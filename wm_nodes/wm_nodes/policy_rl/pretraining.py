@@ -2,7 +2,7 @@
 
 import platform
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import date
 from functools import partial
 from itertools import chain
@@ -23,9 +23,16 @@ from wm_nodes.core.specs import EnvironmentSpec, tool_spec
 from wm_nodes.environments.collection import EXTREME, POLICY_LABEL, CollectionPlan
 from wm_nodes.environments.record import collect_plan, collect_scripted, demonstration_plan
 from wm_nodes.policy_rl.factories import STARTS, policy_actor
-from wm_nodes.policy_rl.initial_policy import MODEL_STARTS, train_weak_policy, write_starts
-from wm_nodes.recording import BagReport, read_episodes, read_spec
+from wm_nodes.policy_rl.initial_policy import (
+    MAX_STARTS,
+    MODEL_STARTS,
+    train_weak_policy,
+    write_episode_starts,
+    write_starts,
+)
+from wm_nodes.recording import read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
+from wm_nodes.recording.training_data import TrainingData, read_training_data
 from wm_nodes.reports.summary import plain
 from wm_nodes.world_model import ActionModel, Tokenizer, WorldModels, load_model_folder, save_model_folder
 from wm_nodes.world_model.folder import action_model_class
@@ -42,6 +49,9 @@ from wm_nodes.world_model.training.tokenizer import train_tokenizer
 from wm_nodes.world_model.validation.acceptance import model_metrics
 from wm_nodes.world_model.validation.controllability import controllability_metrics
 from wm_nodes.world_model.validation.goals import goal_metrics
+
+FEW_STEPS = 16
+"""Of one iteration of the action model: where recorded episodes are longer, their user hears of parts."""
 
 
 def load_arrays(bags: Iterable[Path], config: RunConfig) -> EpisodeArrays:
@@ -120,42 +130,68 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
 
 
 def model_from_recordings(bags: Sequence[Path], config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
+    """model_from_data of bags, unless run_dir/model is there."""
+    folder = run_dir / "model"
+    if (folder / MANIFEST).exists():
+        return folder
+    return model_from_data(read_recordings(bags, config), config, folder, command=command)
+
+
+def read_recordings(bags: Sequence[Path], config: RunConfig) -> TrainingData:
+    """Read what a world model is trained on.
+
+    Raises:
+        BagError: as read_training_data. ValueError: tokenizer.patch_px does not fit the pictures.
+    """
+    spec = read_spec(bags[0])
+    Tokenizer(config.tokenizer, spec.height, spec.width, 0)  # refuses pictures before all of them are read
+    return read_training_data(bags, num_heldout=config.data.num_heldout, seed=config.seed)
+
+
+def model_from_data(
+    data: TrainingData, config: RunConfig, folder: Path, *, command: str = "",
+    say: Callable[[str], object] = lambda text: None,
+) -> Path:
     """Train tokenizer and action model on the recorded episodes of one environment, whichever it is, and measure them
-    on the last of these; returns run_dir/model, with first frames to imagine from.
+    on those held out; returns the folder, with first frames to imagine from. Checkpoints and metrics lie beside it.
 
     Success is the task's rule, or without a task file the recorded flag. There is no text model, so no goals: set
     reward.dense_weight to 0.
 
-    Raises:
-        BagError: bags of different cameras, sizes, actions or states. ValueError: fewer than two complete episodes.
+    Args:
+        say: gets a line for each stage.
     """
-    spec = read_spec(bags[0])
-    recorded = [episode for bag in bags for episode in read_episodes(bag, expected=spec, report=BagReport())]
-    num_heldout = min(config.data.num_heldout, len(recorded) // 4 or 1)
-    if len(recorded) <= num_heldout:
-        raise ValueError(f"{len(recorded)} complete episodes in {', '.join(map(str, bags))}; record at least 2")
-    tasks, folder = model_tasks(spec.task), run_dir / "model"
-    episodes = stack_episodes(recorded, tasks, num_steps=spec.max_episode_steps)
-    seen, heldout = (episodes.select(range(len(recorded))[rows]) for rows in
-                     (slice(-num_heldout), slice(-num_heldout, None)))
-    with explain_memory(compute_device(config.device), tokenizer__batch_size=config.tokenizer.batch_size):
-        tokenizer, tokenizer_metrics = train_tokenizer(seen, config, config.seed, run_dir)
+    device, run_dir = compute_device(config.device), folder.parent
+    spec = data.spec
+    for line in data.summary:
+        say(line)
+    say(f"tokenizer, {config.tokenizer.num_iterations} iterations")
+    with explain_memory(device, tokenizer__batch_size=config.tokenizer.batch_size):
+        tokenizer, tokenizer_metrics = train_tokenizer(data.training, config, config.seed, run_dir)
     probe: PositionProbe | None = None
     if tokenizer.num_positions:
-        probe, _ = train_position_probe(seen, config, config.seed, run_dir)
-    with explain_memory(compute_device(config.device), world_model__batch_size=config.world_model.batch_size):
-        data = tokenise_episodes(tokenizer, seen)
-        action, shown_by, dynamics_metrics = _train_dynamics(tokenizer, data, spec, config, run_dir)
-    models = WorldModels(shown_by, action, None, tasks, tool_spec(spec), {}, probe)
+        probe, _ = train_position_probe(data.training, config, config.seed, run_dir)
+    if not config.world_model.part_steps and (steps := data.training.num_steps) > FEW_STEPS:
+        say(f"every iteration rolls {steps} steps out; --world_model.part_steps {FEW_STEPS} takes random ones, faster")
+    say(f"action model with {config.world_model.num_done_heads} done heads, {config.world_model.num_iterations} "
+        "iterations")
+    with explain_memory(device, world_model__batch_size=config.world_model.batch_size):
+        latents = tokenise_episodes(tokenizer, data.training)
+        action, shown_by, dynamics_metrics = _train_dynamics(tokenizer, latents, spec, config, run_dir)
+    say(f"rollouts of {len(data.heldout)} held-out episodes or parts of them")
+    models = WorldModels(shown_by, action, None, data.tasks, tool_spec(spec), {}, probe)
     story = {
-        "made": _made(command, config), "data": {"episodes": len(seen)},
+        "made": _made(command, config),
+        "data": {"episodes": len(data.episodes), "summary": list(data.summary)},
         "success_threshold": config.reward.success_threshold,
         "training": {"tokenizer": tokenizer_metrics, **dynamics_metrics},
-        "heldout": plain(model_metrics(models, heldout, config)),
+        "heldout": plain(model_metrics(models, data.heldout, config)),
     }
-    write_starts(bags, folder / STARTS, MODEL_STARTS, frames=config.data.start_frames, seed=config.seed)
+    write_episode_starts(
+        data.episodes[:MAX_STARTS], folder / STARTS, frames=config.data.start_frames, seed=config.seed
+    )
     return save_model_folder(
-        folder, tokenizer, action, None, config, spec=spec, tasks=tasks, story=story, probe=probe,
+        folder, tokenizer, action, None, config, spec=spec, tasks=data.tasks, story=story, probe=probe,
         decoder=shown_by.decoder if shown_by is not tokenizer else None,
     )
 

@@ -108,7 +108,8 @@ def stack_episodes(
 ) -> EpisodeArrays:
     """Stack episodes of one camera set-up; longer ones are cut to num_steps (None: the longest decides).
 
-    A task without a rule in its file is done where its recorded episodes say so; `labels` are those of the other tasks.
+    A task without a rule in its file, or without ground truth, is done where its recorded episodes say so; `labels` are
+    those of the other tasks.
 
     Raises:
         ValueError: no episodes, episodes of different image, state or action sizes, or as check_finite.
@@ -131,7 +132,8 @@ def stack_episodes(
         actions[row, : lengths[row]] = episode.actions[: lengths[row]]
     truth = np.stack([e.ground_truth[rows] for e, rows in zip(listed, frame_rows, strict=True)])
     said = np.stack([e.success[rows] for e, rows in zip(listed, frame_rows, strict=True)])
-    with_rule = set(tasks) if labels is not success else {*filter(has_rule, tasks)}
+    by_rule = filter(has_rule, tasks) if truth.shape[-1] else ()
+    with_rule = {*tasks} if labels is not success else {*by_rule}
     return EpisodeArrays(
         images=np.stack([e.images[rows] for e, rows in zip(listed, frame_rows, strict=True)]),
         states=np.stack([s[rows] for s, rows in zip(tool_states, frame_rows, strict=True)]), actions=actions,

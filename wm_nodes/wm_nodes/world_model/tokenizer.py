@@ -57,7 +57,9 @@ class Tokenizer(nn.Module):
         super().__init__()
         patch = config.patch_px
         if height % patch or width % patch:
-            raise ValueError(f"image {height}x{width} px is not a multiple of tokenizer.patch_px {patch}")
+            fitting = [str(side) for side in (16, 8, 4) if height % side == 0 and width % side == 0]
+            remedy = f"set it to {' or '.join(fitting)}" if fitting else "record pictures of other sizes"
+            raise ValueError(f"image {height}x{width} px is not a multiple of tokenizer.patch_px {patch}; {remedy}")
         if patch < 4 or patch & (patch - 1):
             raise ValueError(f"tokenizer.patch_px must be a power of two >= 4, got {patch}")
         self.kind, self.latent_dim, self.height, self.width, self.patch_px = (

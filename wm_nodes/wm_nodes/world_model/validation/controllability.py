@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from wm_nodes.core.specs import EnvironmentSpec
-from wm_nodes.core.tool_control import next_state
+from wm_nodes.core.tool_control import CommandedMove
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.reward.picture_similarity import psnr_db
@@ -62,8 +62,9 @@ def controllability_metrics(
 
 
 def follow(first_ES: FloatArray, actions_ETA: FloatArray, spec: EnvironmentSpec) -> FloatArray:
-    """Commanded states (E, T + 1, S) of actions, from the first ones on."""
-    states = [first_ES]
-    for t in range(actions_ETA.shape[1]):
-        states.append(next_state(states[-1], actions_ETA[:, t], spec))
-    return np.stack(states, 1)
+    """Commanded states (E, T + 1, S) of actions, from the first ones on; measured values stay as they are."""
+    move, actions = CommandedMove(spec, torch.device("cpu")), torch.from_numpy(actions_ETA)
+    states = [torch.from_numpy(first_ES)]
+    for t in range(actions.shape[1]):
+        states.append(move(states[-1], actions[:, t]))
+    return torch.stack(states, 1).numpy()

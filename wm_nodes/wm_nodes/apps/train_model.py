@@ -1,0 +1,132 @@
+"""Train a world model on recordings: pictures, actions, a success flag, and states where there are any.
+
+    wm train-model --bags B... --out FOLDER
+    wm train-policy --task "" --model-dir FOLDER/model --demos B... --evaluation.environment none
+
+A quarter of the episodes is held out, and the model is judged by rollouts of them. FOLDER/model/acceptance.json says
+what passed, what failed, and what could not be judged. The folder alone goes on with a training that was interrupted.
+"""
+
+import argparse
+import json
+import os
+import shlex
+import sys
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from wm_nodes.apps import options
+from wm_nodes.config.load import ConfigError, load_config
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.tasks import VARIABLE, check_task
+from wm_nodes.core.device import compute_device
+from wm_nodes.core.errors import ModelNotAcceptedError
+from wm_nodes.core.files import write_atomic
+from wm_nodes.core.model_folder import MANIFEST
+from wm_nodes.policy_rl.pretraining import model_from_data, read_recordings
+from wm_nodes.recording import read_spec
+from wm_nodes.reports.stages import Stages, console
+from wm_nodes.training.run_record import Starter
+from wm_nodes.world_model.folder import read_world_manifest
+from wm_nodes.world_model.validation.acceptance import AcceptanceReport, report_when_made
+from wm_nodes.world_model.validation.pictures import horizon_table, horizons_of
+
+MODEL = "model"
+"""In the run folder."""
+ACCEPTANCE = "acceptance.json"
+"""In the model folder."""
+FIXED = {"preset": "cpu", "bags": None, "task": ""}
+"""Options that a run keeps with their defaults, see training/run_record.py."""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--bags", nargs="+", type=Path, metavar="BAG", help="recordings of one environment, the graph's or imported"
+    )
+    parser.add_argument(
+        "--task", metavar="NAME|FILE",
+        help="the task of the recordings, by its name or its file (config/tasks.py); its success rule, where it has "
+        "one, labels them. Default: the recorded success flag does",
+    )
+    parser.add_argument(
+        "--out", "--run-dir", dest="run_dir", type=Path, metavar="FOLDER",
+        help="gets the model, metrics and checkpoints; an existing one goes on, with the options it was begun with "
+        "(default: runs/<time>-model)",
+    )
+    options.add_preset(parser, "cpu")
+    options.add_seed(parser, None)
+    parser.set_defaults(**dict.fromkeys(FIXED))
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Train and judge; raises ModelNotAcceptedError where a criterion failed, with the model written."""
+    options.prepare_torch()
+    stage = Stages()
+    with opened(arguments) as (config, folder):
+        stage(f"run folder {folder}")
+        model = folder / MODEL
+        if arguments.data is not None:
+            model_from_data(arguments.data, config, model, command=arguments.command, say=stage)
+        report = _judge(config, model)
+        stage(f"acceptance {report.words}")
+        following = f"--model-dir {model} --demos {shlex.join(map(str, arguments.bags))} --evaluation.environment none"
+        for name, value in (("model", model), ("verdict", model / ACCEPTANCE),
+                            ("next", f'wm train-policy --task "" {following}')):
+            console.print(f"{name:8} {value}", highlight=False, soft_wrap=True, markup=False)
+        if report.failed:
+            raise ModelNotAcceptedError(
+                f"{', '.join(report.failed)} failed (numbers in {model / ACCEPTANCE}); train-policy takes the model "
+                "only with --force"
+            )
+
+
+def opened(arguments: argparse.Namespace) -> AbstractContextManager[tuple[RunConfig, Path]]:
+    """The run folder of the options, see options.open_run; what will be trained on is read into arguments.data, None
+    where the model is there."""
+    def check(config: RunConfig) -> None:
+        compute_device(config.device)
+        if not arguments.bags:
+            raise ConfigError("name recordings with --bags")
+        bags = [Path(bag) for bag in arguments.bags]
+        if arguments.task:
+            _check_task(arguments.task, bags)
+        is_made = arguments.run_dir and (arguments.run_dir.expanduser() / MODEL / MANIFEST).exists()
+        arguments.data = None if is_made else read_recordings(bags, config)
+
+    starter = Starter("train-model", _load, FIXED, {}, options.OPTION_OF, prefix="--")
+    return options.open_run(
+        arguments, starter, options.settings(arguments), name=lambda config: "model", check=check
+    )
+
+
+def _load(file: str, settings: dict[str, Any], chosen: object) -> RunConfig:
+    return load_config(file, {**settings, "task": ""})
+
+
+def _check_task(given: str, bags: list[Path]) -> None:
+    """Find the task, also in a file of its own, and compare it with the recordings'."""
+    file = Path(given)
+    if file.suffix == ".py":
+        if not file.is_file():
+            raise ConfigError(f"--task {given} is no file")
+        sys.path.insert(0, str(file.resolve().parent))
+        os.environ[VARIABLE] = ",".join(filter(None, (os.environ.get(VARIABLE, ""), file.stem)))
+    name = check_task(file.stem if file.suffix == ".py" else given)
+    for bag in bags:
+        if (recorded := read_spec(bag).task) != name:
+            raise ConfigError(f"{bag} was recorded for task {recorded!r}, not {name!r}; leave --task out to take the "
+                              "recorded success flags")
+
+
+def _judge(config: RunConfig, model: Path) -> AcceptanceReport:
+    """Write acceptance.json and print it."""
+    manifest = read_world_manifest(model)
+    metrics = {name: float("nan") if value is None else float(value) for name, value in manifest["heldout"].items()}
+    report = replace(report_when_made(manifest, config), metrics=metrics)
+    write_atomic(model / ACCEPTANCE, json.dumps(report.to_dict(), indent=1).encode())
+    console.print(report.table())
+    if horizons_of(metrics):
+        console.print(horizon_table(metrics))
+    return report

@@ -1,0 +1,109 @@
+"""How far rollouts are from the recording by their pictures alone: what is known without ground truth. Shapes:
+E episodes, T steps, S tokens, D values per token.
+
+The distance of two frames is the mean absolute difference of the latents that the tokenizer encodes them to.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
+from rich.table import Table
+
+from wm_nodes.core.statistics import bootstrap_ratio
+from wm_nodes.core.types import FloatArray, UInt8Array
+from wm_nodes.recording.episode_arrays import EpisodeArrays
+from wm_nodes.reports.console_table import decimal, make_table
+from wm_nodes.world_model.folder import WorldModels
+from wm_nodes.world_model.tokenizer import Tokenizer
+from wm_nodes.world_model.validation.controllability import follow
+from wm_nodes.world_model.validation.open_loop import BATCH, HORIZONS, imagine_episodes
+
+SAME_ACTION = 1e-3
+"""Two episodes whose actions differ by less than this on average show nothing of what actions do."""
+
+
+@torch.inference_mode()
+def picture_metrics(models: WorldModels, episodes: EpisodeArrays) -> dict[str, float]:
+    """Metrics by name, `_hNN` at step NN, of the `feature_episodes` that are at least that long.
+
+    feature_ratio: distance of the rollout to the recording over that of the first frame: 1 is as good as copying it.
+    feature_floor: the same of recorded frames that are encoded and decoded, which a rollout can hardly undercut.
+    other_actions: distance under the next episode's actions over that under the recorded ones, of episodes whose
+    actions differ: 1 where actions are ignored. `_low`, `_high`: 95 %, bootstrap over episodes.
+    """
+    tokenizer, others = models.tokenizer, np.roll(episodes.actions, 1, axis=0)
+    states = follow(episodes.states[:, 0], others, models.spec)
+    rollouts = imagine_episodes(tokenizer, models.action, episodes).frames
+    misled = imagine_episodes(tokenizer, models.action, replace(episodes, actions=others, states=states)).frames
+    differ = np.abs(episodes.actions - others).mean(2)
+    metrics = dict[str, float]()
+    for horizon in sorted({min(h, episodes.num_steps) for h in HORIZONS}):
+        rows = np.flatnonzero(episodes.lengths >= horizon)
+        if not len(rows):
+            continue
+        real = episodes.images[rows, horizon]
+        rolled, copied = (
+            _distances(tokenizer, frames, real) for frames in (rollouts[rows, horizon - 1], episodes.images[rows, 0])
+        )
+        floor = _distances(tokenizer, _reconstructed(tokenizer, real), real)
+        both = (np.roll(episodes.lengths, 1)[rows] >= horizon) & (differ[rows, :horizon].mean(1) > SAME_ACTION)
+        misled_by = _distances(tokenizer, misled[rows[both], horizon - 1], real[both]) if both.any() else rolled[:0]
+        metrics[f"feature_episodes_h{horizon:02d}"] = float(len(rows))
+        metrics[f"feature_floor_h{horizon:02d}"] = _ratio(floor, copied)
+        for name, top, bottom in (("feature_ratio", rolled, copied), ("other_actions", misled_by, rolled[both])):
+            low, high = bootstrap_ratio(top, bottom, seed=0)
+            metrics |= {
+                f"{name}_h{horizon:02d}": _ratio(top, bottom), f"{name}_low_h{horizon:02d}": low,
+                f"{name}_high_h{horizon:02d}": high,
+            }
+    return metrics
+
+
+def horizons_of(metrics: Mapping[str, float | None]) -> list[int]:
+    """The steps of which picture_metrics holds anything, ascending."""
+    return sorted(int(found[1]) for name in metrics if (found := re.fullmatch(r"feature_episodes_h(\d+)", name)))
+
+
+def judged_horizon(metrics: Mapping[str, float | None]) -> int:
+    """The last step that half of the episodes reach; 0 where nothing was measured."""
+    counts = {step: metrics[f"feature_episodes_h{step:02d}"] or 0 for step in horizons_of(metrics)}
+    return max((step for step, count in counts.items() if count >= max(counts.values()) / 2), default=0)
+
+
+def horizon_table(metrics: Mapping[str, float | None]) -> Table:
+    """picture_metrics for the terminal, a row for each step."""
+    def shown(name: str, step: int) -> str:
+        value, low, high = (_number(metrics.get(f"{name}{end}_h{step:02d}")) for end in ("", "_low", "_high"))
+        return decimal(value) + (f" ({low:.2f} to {high:.2f})" if np.isfinite(low) else "")
+
+    columns = ("step", "episodes", "rollout / first frame", "reconstruction / first frame", "other / recorded actions")
+    return make_table("distance to held-out recordings, by features", columns, (
+        (step, int(metrics[f"feature_episodes_h{step:02d}"] or 0), shown("feature_ratio", step),
+         shown("feature_floor", step), shown("other_actions", step))
+        for step in horizons_of(metrics)
+    ), left=())
+
+
+def _distances(tokenizer: Tokenizer, frames: UInt8Array, real: UInt8Array) -> FloatArray:
+    """(E,) of frames and the recorded ones, uint8 (E, H, W, 3)."""
+    rows = [slice(i, i + BATCH) for i in range(0, len(real), BATCH)]
+    parts = [(tokenizer.encode(frames[row]) - tokenizer.encode(real[row])).abs().mean((1, 2)) for row in rows]
+    distances: FloatArray = torch.cat(parts).cpu().numpy()
+    return distances
+
+
+def _reconstructed(tokenizer: Tokenizer, images: UInt8Array) -> UInt8Array:
+    rows = [slice(i, i + BATCH) for i in range(0, len(images), BATCH)]
+    frames: UInt8Array = torch.cat([tokenizer.decode(tokenizer.encode(images[row])) for row in rows]).cpu().numpy()
+    return frames
+
+
+def _ratio(top: FloatArray, bottom: FloatArray) -> float:
+    return float(top.mean() / bottom.mean()) if len(bottom) and bottom.mean() > 0 else float("nan")
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else float(value)
