@@ -43,19 +43,22 @@ MARKS = {"passed": "[green]passed", "failed": "[red]failed[/]: {}", "undecided":
 
 @dataclass(frozen=True)
 class Criterion:
-    """outcome: of value against threshold, as `rule` says. remedy: what to do where it failed.
-
-    value: NaN where it could not be computed. threshold: None where `rule` says everything. interval: 95 %, of the
-    value; None where it is not known. undecided: there are too few episodes to pass or to fail the model.
-    """
+    """One number that a model is judged by."""
 
     name: str
+    """What was measured."""
     value: float
+    """NaN where it could not be computed."""
     threshold: float | None
+    """None where `rule` says everything."""
     rule: str
+    """How value and threshold are compared."""
     outcome: Outcome
+    """Of value against threshold; undecided: there are too few episodes to pass or to fail the model."""
     remedy: str
+    """What to do where it failed."""
     interval: tuple[float, float] | None = None
+    """95 %, of the value; None where it is not known."""
 
     @property
     def passed(self) -> bool:
@@ -64,24 +67,28 @@ class Criterion:
 
 @dataclass(frozen=True)
 class CloneRollouts:
-    """What the policy that training begins with did in the model, bool (E,), and what its actions do in the simulator.
-
-    imagined: success by the model's own done signal. replayed: by the simulator, under the same actions.
-    """
+    """What the policy that training begins with did in the model, and what its actions do in the simulator."""
 
     imagined: BoolArray
+    """(E,), success by the model's own done signal."""
     replayed: BoolArray
+    """(E,), success by the simulator, under the same actions."""
 
 
 @dataclass(frozen=True)
 class AcceptanceReport:
-    """metrics: every number of the rollouts, by the names in docs/metrics.md. notes: what was measured and left out."""
+    """Whether a model passes, and by what."""
 
     task: str
+    """That the model is judged for."""
     episodes: int
+    """Held-out ones, or parts of them."""
     criteria: tuple[Criterion, ...]
+    """What decides."""
     metrics: dict[str, float]
+    """Every number of the rollouts, by the names in docs/metrics.md and of pictures.picture_metrics."""
     notes: tuple[str, ...] = ()
+    """What was measured and left out, and what could not be judged."""
 
     @property
     def outcome(self) -> Outcome:
