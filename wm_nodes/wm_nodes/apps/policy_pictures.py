@@ -29,18 +29,20 @@ NUM_STRIPS = 2
 
 @dataclass(frozen=True)
 class SideBySide:
-    """One episode twice. real: uint8 (T + 1, H, W, 3). imagined: the same actions from the same first frame.
-
-    goal: uint8 (H, W, 3), or None without a text model. real_done, imagined_done: first step of success, or -1.
-    signals: float32 (T,), the done signal of imagined frames 1..T.
-    """
+    """One episode twice: as it was, and imagined under the same actions from the same first frame."""
 
     real: UInt8Array
+    """uint8 (T + 1, H, W, 3)."""
     imagined: UInt8Array
+    """uint8 (T + 1, H, W, 3), the same actions from the same first frame."""
     goal: UInt8Array | None
+    """uint8 (H, W, 3); None without a text model."""
     real_done: int
+    """First step of success, or -1."""
     imagined_done: int
+    """First imagined step of success, or -1."""
     signals: FloatArray
+    """float32 (T,), the done signal of imagined frames 1..T."""
 
 
 def write_pictures(

@@ -38,19 +38,23 @@ MARKS = {"passed": "[green]passed", "failed": "[red]failed[/]: {}", "undecided":
 
 @dataclass(frozen=True)
 class Criterion:
-    """outcome: of value against threshold, as `rule` says. remedy: what to do where it failed.
-
-    value: NaN where it could not be computed. threshold: None where `rule` says everything. interval: 95 %, of the
-    value; None where it is not known. undecided: there are too few episodes to pass or to fail the model.
-    """
+    """One number of a world model, and whether it is good enough."""
 
     name: str
+    """What is measured."""
     value: float
+    """NaN where it could not be computed."""
     threshold: float | None
+    """None where `rule` says everything."""
     rule: str
+    """How value must compare with threshold."""
     outcome: Outcome
+    """Of value against threshold, as `rule` says; undecided: there are too few episodes to pass or to fail the
+    model."""
     remedy: str
+    """What to do where it failed."""
     interval: tuple[float, float] | None = None
+    """95 %, of the value; None where it is not known."""
 
     @property
     def passed(self) -> bool:
@@ -70,13 +74,18 @@ class CloneRollouts:
 
 @dataclass(frozen=True)
 class AcceptanceReport:
-    """metrics: every number of the rollouts, by the names in docs/metrics.md. notes: what was measured and left out."""
+    """Whether a world model may be trained in, criterion by criterion."""
 
     task: str
+    """The task that it was judged for."""
     episodes: int
+    """Held-out episodes; 0 where the frames were not judged."""
     criteria: tuple[Criterion, ...]
+    """All that were judged."""
     metrics: dict[str, float]
+    """Every number of the rollouts, by the names in docs/metrics.md."""
     notes: tuple[str, ...] = ()
+    """What was measured and left out."""
 
     @property
     def outcome(self) -> Outcome:
