@@ -15,11 +15,12 @@ def is_record(node: ast.ClassDef) -> bool:
     return any("dataclass" in text for text in decorators) or any(base.endswith(BASES) for base in bases)
 
 
-def is_public_field(node: ast.stmt) -> bool:
-    return (
-        isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
-        and not node.target.id.startswith("_") and "ClassVar" not in ast.unparse(node.annotation)
-    )
+def public_field(node: ast.stmt) -> str:
+    """Name of the public field that the statement declares; empty where it declares none."""
+    if not isinstance(node, ast.AnnAssign) or "ClassVar" in ast.unparse(node.annotation):
+        return ""
+    name = ast.unparse(node.target)
+    return "" if name.startswith("_") else name
 
 
 def is_text(node: ast.stmt | None) -> bool:
@@ -28,11 +29,11 @@ def is_text(node: ast.stmt | None) -> bool:
 
 def unexplained_fields(record: ast.ClassDef) -> list[str]:
     """Names of the public fields without a string under them; none where the record has fewer than three fields."""
-    followed = list(zip(record.body, [*record.body[1:], None], strict=True))
-    fields = [(field, below) for field, below in followed if is_public_field(field)]
-    lacking = [ast.unparse(field.target) for field, below in fields
-               if isinstance(field, ast.AnnAssign) and not is_text(below)]
-    return lacking if len(fields) >= 3 else []
+    fields = {
+        name: is_text(below) for node, below in zip(record.body, [*record.body[1:], None], strict=True)
+        if (name := public_field(node))
+    }
+    return [name for name, explained in fields.items() if not explained] if len(fields) >= 3 else []
 
 
 def records_lacking(source: str) -> dict[str, list[str]]:

@@ -36,11 +36,11 @@ class SideBySide:
     imagined: UInt8Array
     """uint8 (T + 1, H, W, 3), the same actions from the same first frame."""
     goal: UInt8Array | None
-    """uint8 (H, W, 3); None without a text model."""
+    """uint8 (H, W, 3), imagined; None without a text model."""
     real_done: int
-    """First step of success, or -1."""
+    """First real frame that shows success, or -1."""
     imagined_done: int
-    """First imagined step of success, or -1."""
+    """First imagined frame whose done signal is above reward.success_threshold, or -1."""
     signals: FloatArray
     """float32 (T,), the done signal of imagined frames 1..T."""
 

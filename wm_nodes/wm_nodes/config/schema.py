@@ -91,9 +91,9 @@ class TokenizerConfig(SettingsSection):
     batch_size: PositiveInt
     """Frames per gradient step."""
     learning_rate: PositiveFloat
-    """Of the optimizer."""
+    """Of encoder, decoder and probe."""
     entropy_weight: NonNegativeFloat
-    """Weight of the loss by which all codes are used; lfq only."""
+    """Weight of the loss that makes every token sure of its code, and all codes used; lfq only."""
     commitment_weight: NonNegativeFloat
     """Weight of the loss that keeps the encoder's output near its code; lfq only."""
     foreground_weight: NonNegativeFloat
@@ -249,9 +249,9 @@ class JudgeConfig(SettingsSection):
     tries: PositiveInt
     """Requests per call, over all endpoints."""
     json_timeout_s: PositiveFloat
-    """Of one try for an answer with reasons."""
+    """Longest wait of one try for an answer with reasons."""
     label_timeout_s: PositiveFloat
-    """Of one try for an answer of a single token."""
+    """Longest wait of one try for an answer of a single token."""
     max_images: Annotated[int, Field(ge=2)]
     """Images that the server takes in one call."""
     video: bool
@@ -337,13 +337,13 @@ class PpoConfig(SettingsSection):
     gae_lambda: Fraction
     """gae: 0 gives one-step TD errors, 1 sums to the end of the episode."""
     clip: PositiveFloat
-    """The ratio of new to old probability counts within 1 - clip and 1 + clip."""
+    """The ratio of an action's new to its old probability counts down to 1 - clip and up to 1 + clip."""
     value_clip: NonNegativeFloat
     """0: the value loss is not clipped."""
     epochs: PositiveInt
     """Passes over a rollout per update."""
     minibatch_size: PositiveInt
-    """Transitions per gradient step, about."""
+    """About so many transitions per gradient step."""
     learning_rate: PositiveFloat
     """Of the actor."""
     value_learning_rate: PositiveFloat
@@ -389,11 +389,11 @@ class RunConfig(SettingsSection):
     environment: EnvironmentConfig
     """The real environment."""
     simulation: SimulationConfig
-    """The tasks that come with the package, in ManiSkill."""
+    """The simulator's scenes, cameras, actions and limits, of `task`."""
     gymnasium: GymnasiumConfig
     """A Gymnasium environment."""
     data: DataConfig
-    """Episodes that the world model learns from."""
+    """Episodes that are collected for the world model."""
     tokenizer: TokenizerConfig
     """Observations to latent tokens and back."""
     world_model: WorldModelConfig

@@ -40,7 +40,7 @@ class EnvironmentSpec:
     source: int
     """EnvSpec.SOURCE_* as an int."""
     num_envs: int
-    """N."""
+    """N, environments that step together."""
     height: int
     """Of one environment's image, px."""
     width: int

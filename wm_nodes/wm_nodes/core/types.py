@@ -39,7 +39,7 @@ class StepResult:
     """What one lock-step of N environments gives."""
 
     observation: Observation
-    """What the step reached."""
+    """What the environments show after it."""
     terminated: BoolArray
     """bool (N,), the task is over."""
     truncated: BoolArray

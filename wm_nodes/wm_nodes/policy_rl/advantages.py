@@ -64,13 +64,13 @@ class GroupAdvantages:
     """Advantages of whole episodes against their groups."""
 
     advantages_TN: Tensor
-    """float32, 0 where counted_TN is False."""
+    """float32 (T, N), 0 where counted_TN is False."""
     counted_TN: Tensor
-    """bool, the steps to train on."""
+    """bool (T, N), the steps to train on."""
     groups_without_signal: int
     """Groups of equal returns, or of a single one."""
     episodes_without_return: int
-    """Left out."""
+    """Episodes with an invalid step, left out."""
 
 
 def group_advantages(

@@ -31,11 +31,11 @@ class ImageEncoder:
     function: Callable[[Tensor], Tensor]
     """uint8 (B, H, W, 3) -> float (B, F)."""
     feature_dim: int
-    """F."""
+    """F, features of an image."""
     sha256: str = ""
     """Of the weights behind it; "" when it has none."""
     num_positions: int = 0
-    """The last features that are positions, which a policy does not project."""
+    """How many of the last features are positions, which a policy does not project."""
 
     def __call__(self, images_BHWC: Tensor) -> Tensor:
         with torch.no_grad():

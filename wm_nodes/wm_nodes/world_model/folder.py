@@ -55,7 +55,7 @@ class WorldModels:
     """Of one of the environments that the model was trained on, see core.specs.tool_spec; those of its other tasks
     differ in task, instruction and ground truth alone."""
     manifest: Mapping[str, Any]
-    """The folder's manifest."""
+    """Says how they were made; holds their checksums."""
     probe: PositionProbe | None = None
     """The judge's; None where the model was saved without it."""
 

@@ -31,7 +31,7 @@ class RowLabel(_FrozenModel):
     answer: Literal["pass", "fail", "unsure"]
     """Of the row."""
     level: Annotated[int, Field(ge=0, lt=NUM_LEVELS)] | None = None
-    """Where the person gave one."""
+    """Where the person gave one, from 0."""
     explanation: bool | None = None
     """Whether the judge's reason is right; None: not said."""
 
@@ -53,7 +53,7 @@ class HumanLabels(_FrozenModel):
     """What one person said of the clips of one page."""
 
     format: Literal["audit-labels-1"]
-    """Of the file."""
+    """Name and version of the file's format."""
     head: str
     """Hash of the log's last line when the page was written."""
     annotator: Annotated[str, Field(min_length=1)]
