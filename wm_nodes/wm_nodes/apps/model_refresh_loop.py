@@ -36,18 +36,20 @@ Judge = Callable[[BoolArray, BoolArray | None], None]
 
 @dataclass(frozen=True)
 class ModelRefreshLoop:
-    """What a run's rounds gave. Success: bool (E,), before the first round in its model and after the last in its."""
+    """What a run's rounds gave."""
 
     policy: Path
     """The weights after the last round."""
     model_dir: Path
     """What they were trained in."""
     real_before: BoolArray | None
+    """Success in evaluation.environment before the first round, bool (E,); None where that is none."""
     real_after: BoolArray | None
-    """Success in evaluation.environment; None where that is none."""
+    """The same after the last round."""
     imagined_before: BoolArray
+    """Success in the first round's model before that round, bool (E,)."""
     imagined_after: BoolArray
-    """Success in the model."""
+    """Success in the last round's model after that round, bool (E,)."""
     samples: int
     """Transitions of all rounds."""
     samples_per_s: float

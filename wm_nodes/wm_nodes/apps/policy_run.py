@@ -44,10 +44,13 @@ class RunContext:
     """What all trainings of a run share."""
 
     config: RunConfig
+    """The run's settings."""
     run_dir: Path
+    """The run folder."""
     starts: Path
     """First frames to imagine from."""
     stage: Stages
+    """Prints which stage the run is in."""
     domain_id: str = ""
     """ROS domain; empty: $ROS_DOMAIN_ID, else 0."""
     compose: bool = False
@@ -81,9 +84,11 @@ class TrainingStart:
     folder: Path
     """Its own run folder."""
     model_dir: Path
+    """The world model to train in."""
     policy: Path
     """Weights that it starts from."""
     config: RunConfig
+    """Settings of this training."""
     starts: Path
     """Frames to imagine from."""
     label: str = ""
@@ -97,11 +102,13 @@ class TrainingResult:
     version: int
     """Of the last weights."""
     updates: int
+    """Updates made."""
     samples: int
     """Transitions trained on."""
     samples_per_s: float
     """Of the last uninterrupted part."""
     bag: str
+    """Recording of the training."""
     stopped: str = ""
     """Why training ended before all updates; else empty."""
 

@@ -78,6 +78,7 @@ class Outcome:
     equal: bool
     """Whether all that could be compared is the recorded, bit by bit."""
     said: Sequence[str | Table]
+    """Lines and tables to print, in order."""
     content: Mapping[str, Any]
     """For the file of --json."""
 

@@ -50,8 +50,9 @@ class SimulationConfig(SettingsSection):
     max_action_rad: PositiveFloat = 0.2
     """Rotation of the commanded tool by a full-scale action, rad per axis and step; only where Task.actions is pose."""
     workspace_low_m: tuple[float, float, float]
+    """Lower corner (x, y, z) of the box that the commanded tool position stays in, robot base frame, m."""
     workspace_high_m: tuple[float, float, float]
-    """Box that the commanded tool position stays in, robot base frame, m."""
+    """Upper corner of that box."""
     max_episode_steps: PositiveInt
     """An episode is truncated after this many steps."""
     render_device: str
@@ -82,14 +83,19 @@ class TokenizerConfig(SettingsSection):
     latent_dim: PositiveInt
     """Values per token (continuous), or bits per token (lfq)."""
     width: PositiveInt
+    """Channels of the encoder, and of the decoder, at one cell per token."""
     depth: PositiveInt
-    """Transformer width and number of blocks of the encoder, and of the decoder."""
+    """Residual blocks there, of the encoder and of the decoder."""
     num_iterations: PositiveInt
+    """Gradient steps."""
     batch_size: PositiveInt
+    """Frames per gradient step."""
     learning_rate: PositiveFloat
+    """Of encoder, decoder and probe."""
     entropy_weight: NonNegativeFloat
+    """Weight of the loss that makes every token sure of its code, and all codes used; lfq only."""
     commitment_weight: NonNegativeFloat
-    """lfq only."""
+    """Weight of the loss that keeps the encoder's output near its code; lfq only."""
     foreground_weight: NonNegativeFloat
     """Extra weight of foreground pixels."""
     probe_weight: NonNegativeFloat = 0.1
@@ -110,13 +116,19 @@ class TokenizerConfig(SettingsSection):
 
 class WorldModelConfig(SettingsSection):
     width: PositiveInt
+    """Transformer width."""
     depth: PositiveInt
+    """Transformer blocks."""
     num_heads: PositiveInt
+    """Attention heads per block."""
     window: PositiveInt
     """Frames the temporal attention looks back over."""
     num_iterations: PositiveInt
+    """Gradient steps of the action model."""
     batch_size: PositiveInt
+    """Episodes, or parts of episodes, per gradient step."""
     learning_rate: PositiveFloat
+    """Of the action model; the text model takes half of it."""
     condition_map: NonNegativeInt = 0
     """Hidden width of the MLP by which every token's input depends on the whole action and pose; 0: none (not lfq)."""
     rollout_steps: list[PositiveInt]
@@ -167,7 +179,9 @@ class RewardConfig(SettingsSection):
     mode: Literal["delta", "abs", "progress"]
     """Dense reward (RS-5): change of the goal distance, its level, or progress along the golden trajectory."""
     dense_weight: NonNegativeFloat
+    """Factor of the dense reward; 0: no goal is needed."""
     sparse_weight: NonNegativeFloat
+    """Reward of the step on which the done signal crosses success_threshold."""
     success_threshold: Fraction
     """tau_s of RS-7: the done signal above which the sparse reward is paid and the episode terminates."""
     goal_threshold: Fraction
@@ -184,12 +198,19 @@ class StageJudge(SettingsSection):
     """A judge of some stages of every clip; as in JudgeConfig, whose other values it shares."""
 
     kind: Literal["openai", "embedded"] = "openai"
+    """openai: a server; embedded: a judge in this process, from `folder`."""
     endpoints: list[str] = Field(default=[])
+    """openai: base URLs with their /v1, in the order in which they are tried."""
     model: str = ""
+    """openai: the model's name on the server."""
     api_key_env: str = ""
+    """openai: name of the environment variable that holds the key; empty: the server wants none."""
     folder: str = ""
+    """embedded: folder of a world model with normal ranges; empty: the shipped one of the task."""
     extra_body: dict[str, Any] = Field(default={})
+    """openai: further fields of every request."""
     stages: Annotated[list[Literal["PLAN", "VQ", "IF", "TC", "PC", "HACK"]], Field(min_length=1)]
+    """The stages that it judges."""
 
 
 class JudgeConfig(SettingsSection):
@@ -228,8 +249,9 @@ class JudgeConfig(SettingsSection):
     tries: PositiveInt
     """Requests per call, over all endpoints."""
     json_timeout_s: PositiveFloat
+    """Longest wait of one try for an answer with reasons."""
     label_timeout_s: PositiveFloat
-    """Of one try: an answer with reasons, and one of a single token."""
+    """Longest wait of one try for an answer of a single token."""
     max_images: Annotated[int, Field(ge=2)]
     """Images that the server takes in one call."""
     video: bool
@@ -255,8 +277,9 @@ class JudgeConfig(SettingsSection):
 
 class PolicyConfig(SettingsSection):
     width: PositiveInt
+    """Hidden width of the actor, and of the critic."""
     depth: PositiveInt
-    """Hidden width and layers of the actor, and of the critic."""
+    """Hidden layers of the actor, and of the critic."""
     projection: PositiveInt
     """Width to which the encoder features are projected first; keeps the weights below the 1 MiB that travel inline."""
     init_log_std: float
@@ -282,15 +305,20 @@ class SftConfig(SettingsSection):
     num_demonstrations: PositiveInt
     """Up to 750, with a third more in reserve, no two root seeds share a reset seed."""
     num_iterations: PositiveInt
+    """Gradient steps."""
     batch_size: PositiveInt
+    """Transitions per gradient step."""
     learning_rate: PositiveFloat
+    """Of the actor."""
     bags: list[str] = Field(default=[])
     """Recordings whose successful episodes are the demonstrations, whoever acted; empty: MPLib plans them."""
 
 
 class PpoConfig(SettingsSection):
     updates: NonNegativeInt
+    """Updates of the training, each on a rollout of num_steps lock-steps."""
     num_envs: PositiveInt
+    """Environments that step together."""
     num_steps: PositiveInt
     """Lock-steps per update."""
     advantage: Literal["gae", "group"]
@@ -305,19 +333,29 @@ class PpoConfig(SettingsSection):
     leave_one_out: bool
     """group: compare an episode with the mean of the others only."""
     gamma: Fraction
+    """Discount of the reward one step later."""
     gae_lambda: Fraction
+    """gae: 0 gives one-step TD errors, 1 sums to the end of the episode."""
     clip: PositiveFloat
+    """The ratio of an action's new to its old probability counts down to 1 - clip and up to 1 + clip."""
     value_clip: NonNegativeFloat
     """0: the value loss is not clipped."""
     epochs: PositiveInt
+    """Passes over a rollout per update."""
     minibatch_size: PositiveInt
+    """About so many transitions per gradient step."""
     learning_rate: PositiveFloat
+    """Of the actor."""
     value_learning_rate: PositiveFloat
+    """Of the critic."""
     value_weight: NonNegativeFloat
+    """Weight of the value loss."""
     entropy_weight: NonNegativeFloat
+    """Weight of the bonus for the policy's entropy."""
     kl_reference_weight: NonNegativeFloat
     """Weight of KL(policy || SFT policy), against exploiting the model."""
     max_grad_norm: PositiveFloat
+    """Gradients of a larger norm are scaled down to it."""
     target_kl: NonNegativeFloat
     """An update ends before the first minibatch whose approximate KL to the policy that acted is above it, nats; 0:
     never."""
@@ -343,27 +381,47 @@ class PpoConfig(SettingsSection):
 
 class RunConfig(SettingsSection):
     seed: NonNegativeInt
+    """Root of all random numbers."""
     task: TaskName
+    """Name of the task; empty: none."""
     device: DeviceName
     """Of every model, reward and learner. Processes that collect in the simulator compute on the CPU."""
     environment: EnvironmentConfig
+    """The real environment."""
     simulation: SimulationConfig
+    """The simulator's scenes, cameras, actions and limits, of `task`."""
     gymnasium: GymnasiumConfig
+    """A Gymnasium environment."""
     data: DataConfig
+    """Episodes that are collected for the world model."""
     tokenizer: TokenizerConfig
+    """Observations to latent tokens and back."""
     world_model: WorldModelConfig
+    """The action model and the text model, over latent tokens."""
     imagined_environment: ImaginedEnvironmentConfig
+    """The world model as an environment."""
     video_environment: VideoEnvironmentConfig
+    """The video model as an environment."""
     reward: RewardConfig
+    """What imagined steps are worth."""
     judge: JudgeConfig
+    """The reward agent."""
     policy: PolicyConfig
+    """The actor and the critic."""
     learner: LearnerConfig
+    """What trains the policy."""
     sft: SftConfig
+    """Behaviour cloning of the weak policy that RL begins with."""
     ppo: PpoConfig
+    """RL of the policy."""
     exploit_meter: ExploitMeterConfig
+    """How often the simulator is asked about imagined success."""
     acceptance: AcceptanceConfig
+    """What a world model must show before it is trained in."""
     model_refresh: ModelRefreshConfig
+    """Rounds of training and of refreshing the model."""
     evaluation: EvaluationConfig
+    """How the policy is measured."""
 
     @model_validator(mode="after")
     def _check_scenes(self) -> Self:

@@ -29,13 +29,18 @@ class RunFolderInUseError(OSError):
 
 @dataclass(frozen=True)
 class Holder:
-    """started: clock ticks from boot to the process's start, by which a later process of the same number is told."""
+    """The process that holds a run folder's lock."""
 
     host: str
+    """Host name."""
     process: int
+    """Process number."""
     since: str
+    """Local time at which it took the lock, to the second."""
     command: str
+    """Its command line, cut after 200 characters."""
     started: int
+    """Clock ticks from boot to the process's start, by which a later process of the same number is told; 0: unknown."""
     pid_namespace: str
     """Process numbers mean something in their own container only."""
 

@@ -29,30 +29,50 @@ ROBOT = ("action_names", "action_units", "state_names", "state_units")
 
 @dataclass(frozen=True)
 class EnvironmentSpec:
-    """See msgs_schema/msg/EnvSpec.msg, field by field. Sizes in px, control_period_s in s."""
+    """What an environment is; see msgs_schema/msg/EnvSpec.msg, field by field."""
 
     env_id: str
+    """E.g. wm/push_cube or maniskill/push_cube."""
     task: str
+    """E.g. push_cube."""
     instruction: str
+    """The task in natural language."""
     source: int
+    """EnvSpec.SOURCE_* as an int."""
     num_envs: int
+    """N, environments that step together."""
     height: int
+    """Of one environment's image, px."""
     width: int
+    """Of one environment's image, px, all cameras side by side."""
     cameras: tuple[str, ...]
+    """Left to right inside an image."""
     action_names: tuple[str, ...]
+    """(A,), e.g. tool_dx."""
     action_units: tuple[str, ...]
+    """(A,), unit of one full-scale action (value 1.0)."""
     action_scale: tuple[float, ...]
+    """(A,), physical size of action 1.0, in action_units."""
     state_names: tuple[str, ...]
+    """(S,), e.g. tool_target_x."""
     state_units: tuple[str, ...]
+    """(S,), e.g. m."""
     ground_truth_names: tuple[str, ...]
+    """(P,), what the simulator says of the true state; empty where unknown."""
     control_period_s: float
+    """Between two observations, s."""
     max_episode_steps: int
+    """A step that reaches it is truncated."""
     state_low: tuple[float, ...] = ()
+    """(S,), lower side of the box that actions cannot leave, in state_units; empty: no box."""
     state_high: tuple[float, ...] = ()
-    """Box that actions cannot leave, state units; empty: no box."""
+    """(S,), upper side of that box."""
     world_model_sha256: str = ""
+    """Of the world model that imagines; empty for a simulator."""
     channels: int = 3
+    """Values per pixel."""
     encoding: str = "rgb8"
+    """Of the image, as in sensor_msgs."""
 
     @property
     def action_dim(self) -> int:

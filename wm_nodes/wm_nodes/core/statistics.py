@@ -21,21 +21,26 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """Success after minus success before, on the same seeds. low, high: Tango's score interval (1998).
-
-    kept: succeeded both times. lost: only before. gained: only after. failed: never.
-    mcnemar_p: exact two-sided binomial test of lost against gained.
-    """
+    """Success after minus success before, on the same seeds."""
 
     episodes: int
+    """Pairs compared."""
     kept: int
+    """Succeeded both times."""
     lost: int
+    """Succeeded only before."""
     gained: int
+    """Succeeded only after."""
     failed: int
+    """Never succeeded."""
     difference: float
+    """Success rate after minus success rate before."""
     low: float
+    """Lower end of Tango's score interval (1998) of the difference."""
     high: float
+    """Upper end of that interval."""
     mcnemar_p: float
+    """p of the exact two-sided binomial test of lost against gained."""
 
 
 def wilson_interval(successes: float, episodes: float, *, z: float = Z_95) -> tuple[float, float]:

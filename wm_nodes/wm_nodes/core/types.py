@@ -22,37 +22,36 @@ UInt64Array = NDArray[np.uint64]
 
 @dataclass(frozen=True)
 class Observation:
-    """What N environments show.
-
-    image: uint8 (N, H, W, 3), cameras side by side along W.
-    state: float32 (N, S), units per spec (commanded tool position, m, robot base frame).
-    episode_id: uint64 (N,). episode_step: uint32 (N,), 0 right after a reset.
-    """
+    """What N environments show."""
 
     image: UInt8Array
+    """uint8 (N, H, W, 3), cameras side by side along W."""
     state: FloatArray
+    """float32 (N, S), units per spec (commanded tool position, m, robot base frame)."""
     episode_id: UInt64Array
+    """uint64 (N,)."""
     episode_step: NDArray[np.uint32]
+    """uint32 (N,), 0 right after a reset."""
 
 
 @dataclass(frozen=True)
 class StepResult:
-    """What one lock-step of N environments gives.
-
-    terminated: bool (N,), the task is over. truncated: bool (N,), cut by the step limit; never both.
-    success_probability: float32 (N,), the model's done signal on the next observation; 0 or 1 in a simulator.
-    uncertainty: float32 (N,), >= 0, disagreement of the done heads; 0 in a simulator.
-    ground_truth: float32 (N, P) after the step; NaN where nobody knows (imagined).
-    valid: bool (N,), False where the environment was reset instead of stepped, or is waiting for a reset.
-    """
+    """What one lock-step of N environments gives."""
 
     observation: Observation
+    """What the environments show after it."""
     terminated: BoolArray
+    """bool (N,), the task is over."""
     truncated: BoolArray
+    """bool (N,), cut by the step limit; never together with terminated."""
     success_probability: FloatArray
+    """float32 (N,), the model's done signal on the next observation; 0 or 1 in a simulator."""
     uncertainty: FloatArray
+    """float32 (N,), >= 0, disagreement of the done heads; 0 in a simulator."""
     ground_truth: FloatArray
+    """float32 (N, P) after the step; NaN where nobody knows (imagined)."""
     valid: BoolArray
+    """bool (N,), False where the environment was reset instead of stepped, or is waiting for a reset."""
 
 
 class Environment(Protocol):
@@ -83,30 +82,40 @@ class Environment(Protocol):
 
 @dataclass(frozen=True)
 class Episode:
-    """One recorded episode of one environment, T steps.
-
-    images: uint8 (T + 1, H, W, 3). states: float32 (T + 1, S). actions: float32 (T, A) as executed, in [-1, 1].
-    ground_truth: float32 (T + 1, P), NaN where unknown. success: bool (T + 1,), the task's success at each frame.
-    rewards: float32 (T,), NaN where missing. terminated, truncated: the flags of the last step.
-    behaviour: who acted (expert, noisy, near_miss, policy, ...). source: EnvSpec.SOURCE_* as an int.
-    """
+    """One recorded episode of one environment, T steps."""
 
     images: UInt8Array
+    """uint8 (T + 1, H, W, 3)."""
     states: FloatArray
+    """float32 (T + 1, S)."""
     actions: FloatArray
+    """float32 (T, A) as executed, in [-1, 1]."""
     ground_truth: FloatArray
+    """float32 (T + 1, P), NaN where unknown."""
     success: BoolArray
+    """bool (T + 1,), the task's success at each frame."""
     rewards: FloatArray
+    """float32 (T,), NaN where missing."""
     terminated: bool
+    """Flag of the last step: the task is over."""
     truncated: bool
+    """Flag of the last step: cut by the step limit."""
     task: str
+    """Name of the task."""
     instruction: str
+    """The task in natural language."""
     behaviour: str
+    """Who acted (expert, noisy, near_miss, policy, ...)."""
     seed: int
+    """Of the reset."""
     episode_id: int
+    """As in Observation."""
     source: int
+    """EnvSpec.SOURCE_* as an int."""
     policy_version: int = 0
+    """The learner step whose weights acted."""
     extra: Mapping[str, Any] = field(default_factory=dict)
+    """What else is recorded of it, by name; must fit into JSON."""
 
     @property
     def num_steps(self) -> int:
@@ -115,24 +124,29 @@ class Episode:
 
 @dataclass(frozen=True)
 class Rollout:
-    """T lock-steps of N environments, what the policy learner trains on. Suffix TN: (T, N, ...).
-
-    images_TN: uint8 (T, N, H, W, 3), states_TN: float32 (T, N, S): the observations the actions answer.
-    next_images_TN, next_states_TN: the observations the steps reached (truncated steps bootstrap from them).
-    actions_TN: float32 (T, N, A) as executed, in [-1, 1]. logprobs_TN, values_TN: float32 (T, N).
-    rewards_TN: float32 (T, N). terminated_TN, truncated_TN, valid_TN: bool (T, N).
-    policy_version: the learner step whose weights acted.
-    """
+    """T lock-steps of N environments, what the policy learner trains on. Suffix TN: (T, N, ...)."""
 
     images_TN: UInt8Array
+    """uint8 (T, N, H, W, 3), of the observations that the actions answer."""
     states_TN: FloatArray
+    """float32 (T, N, S), of the same observations."""
     next_images_TN: UInt8Array
+    """uint8 (T, N, H, W, 3), of the observations that the steps reached (truncated steps bootstrap from them)."""
     next_states_TN: FloatArray
+    """float32 (T, N, S), of the same observations."""
     actions_TN: FloatArray
+    """float32 (T, N, A) as executed, in [-1, 1]."""
     logprobs_TN: FloatArray
+    """float32 (T, N), of the actions, nats."""
     values_TN: FloatArray
+    """float32 (T, N), of the observations that the actions answer."""
     rewards_TN: FloatArray
+    """float32 (T, N)."""
     terminated_TN: BoolArray
+    """bool (T, N), as in StepResult."""
     truncated_TN: BoolArray
+    """bool (T, N), as in StepResult."""
     valid_TN: BoolArray
+    """bool (T, N), False where the step is skipped in training."""
     policy_version: int
+    """The learner step whose weights acted."""

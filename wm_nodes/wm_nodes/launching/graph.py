@@ -24,9 +24,11 @@ class NodeSpec:
     module: str
     """That `python -m` starts."""
     name: str
+    """Of the node, without its namespace."""
     namespace: str = "/wm"
     """Absolute."""
     parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
+    """ROS parameters, by name."""
     respawn: bool = False
     """It is started again instead."""
     lifecycle: bool = True
@@ -92,7 +94,9 @@ class Graph:
     """The nodes of one scenario."""
 
     name: str
+    """Of the scenario."""
     nodes: tuple[NodeSpec, ...]
+    """The processes to start; a composed one carries several nodes."""
     environment: Mapping[str, str] = field(default_factory=dict)
     """Variables of all nodes."""
 

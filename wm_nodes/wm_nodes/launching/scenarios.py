@@ -36,7 +36,9 @@ class LaunchArgument:
     """One `name:=value` argument."""
 
     name: str
+    """Stands before `:=`."""
     default: str
+    """The value where none is given."""
     help: str
     """Without a full stop at its end."""
     choices: tuple[str, ...] = ()
@@ -303,7 +305,9 @@ class Scenario:
     """A named graph."""
 
     name: str
+    """By which it is launched."""
     summary: str
+    """What it is for, one line."""
     arguments: tuple[str, ...]
     """Names in ARGUMENTS, in the order in which --show-args lists them."""
     build: Callable[[Mapping[str, str]], Graph]

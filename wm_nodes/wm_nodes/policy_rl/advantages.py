@@ -61,15 +61,16 @@ def gae(
 
 @dataclass(frozen=True)
 class GroupAdvantages:
-    """advantages_TN: float32. counted_TN: bool, the steps to train on; elsewhere advantages are 0.
-
-    groups_without_signal: groups of equal returns, or of a single one. episodes_without_return: left out.
-    """
+    """Advantages of whole episodes against their groups."""
 
     advantages_TN: Tensor
+    """float32 (T, N), 0 where counted_TN is False."""
     counted_TN: Tensor
+    """bool (T, N), the steps to train on."""
     groups_without_signal: int
+    """Groups of equal returns, or of a single one."""
     episodes_without_return: int
+    """Episodes with an invalid step, left out."""
 
 
 def group_advantages(

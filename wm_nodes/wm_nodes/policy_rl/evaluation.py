@@ -18,17 +18,18 @@ ROWS = 16
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """Arrays in the order of the seeds first_seed, first_seed + 1, ...
-
-    success: bool (E,), the episode terminated before its step limit. length: uint32 (E,), steps made.
-    low, high: 95 % Wilson interval of the success rate.
-    """
+    """E episodes of one policy; arrays in the order of the seeds first_seed, first_seed + 1, ..."""
 
     success: BoolArray
+    """bool (E,), the episode terminated before its step limit."""
     length: NDArray[np.uint32]
+    """uint32 (E,), steps made."""
     first_seed: int
+    """Reset seed of the first episode."""
     low: float
+    """Lower end of the 95 % Wilson interval of the success rate."""
     high: float
+    """Upper end of that interval."""
 
     @property
     def episodes(self) -> int:

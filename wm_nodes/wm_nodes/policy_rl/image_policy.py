@@ -26,16 +26,16 @@ _RELATIVE_STD_FLOOR = 0.1
 
 @dataclass(frozen=True)
 class ImageEncoder:
-    """A frozen image encoder.
-
-    function: uint8 (B, H, W, 3) -> float (B, F). sha256: of the weights behind it; "" when it has none.
-    num_positions: the last features that are positions, which a policy does not project.
-    """
+    """A frozen image encoder."""
 
     function: Callable[[Tensor], Tensor]
+    """uint8 (B, H, W, 3) -> float (B, F)."""
     feature_dim: int
+    """F, features of an image."""
     sha256: str = ""
+    """Of the weights behind it; "" when it has none."""
     num_positions: int = 0
+    """How many of the last features are positions, which a policy does not project."""
 
     def __call__(self, images_BHWC: Tensor) -> Tensor:
         with torch.no_grad():
@@ -50,11 +50,14 @@ class ImageEncoder:
 
 @dataclass(frozen=True)
 class PolicyOutput:
-    """actions: float32 (B, A) in [-1, 1], to execute. logprobs: float32 (B,), nats. values: float32 (B,)."""
+    """What a policy does with B observations."""
 
     actions: FloatArray
+    """float32 (B, A) in [-1, 1], to execute."""
     logprobs: FloatArray
+    """float32 (B,), nats."""
     values: FloatArray
+    """float32 (B,)."""
 
 
 def commanded_range(spec: EnvironmentSpec, config: PolicyConfig) -> tuple[Sequence[float], Sequence[float]]:

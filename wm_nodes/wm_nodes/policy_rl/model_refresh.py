@@ -34,14 +34,20 @@ from wm_nodes.world_model.validation.open_loop import episode_errors
 
 @dataclass(frozen=True)
 class ModelComparison:
-    """Means over the same held-out episodes, and the 95 % interval of new less old. error: whether less is better."""
+    """Means of the old and the new model over the same held-out episodes."""
 
     name: str
+    """What is compared, with its unit."""
     old: float
+    """Mean of the old model."""
     new: float
+    """Mean of the new model."""
     low: float
+    """Lower end of the 95 % interval of new less old."""
     high: float
+    """Upper end of that interval."""
     error: bool
+    """Whether less is better."""
 
     @property
     def better(self) -> bool:
@@ -214,6 +220,7 @@ class Round:
     folder: Path
     """What the round leaves, where there are several."""
     last: bool
+    """Whether it is the run's last one."""
 
 
 def round_of(config: RunConfig, run_dir: Path, number: int, model_dir: Path, first_frames: Path) -> Round:

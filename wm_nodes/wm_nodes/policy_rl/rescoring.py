@@ -19,12 +19,16 @@ from wm_nodes.reward import RewardModel, RewardResult, RuleReward
 
 @dataclass
 class RescoreReport:
-    """different: a line per lock-step whose rewards are not bit-equal. unrewarded, without_images: not compared."""
+    """How the rewards of a recording compare with those given again."""
 
     compared: int = 0
+    """Lock-steps evaluated again."""
     different: list[str] = field(default_factory=list)
+    """A line per lock-step whose rewards are not bit-equal."""
     unrewarded: int = 0
+    """Lock-steps without reward, not compared."""
     without_images: int = 0
+    """Lock-steps without images, not compared."""
 
     @property
     def equal(self) -> bool:

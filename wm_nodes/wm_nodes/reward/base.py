@@ -15,26 +15,27 @@ SUCCESS_NO, SUCCESS_YES, SUCCESS_UNKNOWN = 0, 1, 2
 
 @dataclass(frozen=True)
 class RewardInput:
-    """One step of N environments: the images before and after it, and what is known about the image after it.
-
-    images, next_images: uint8 (N, H, W, 3).
-    success_probability: float32 (N,), done signal on next_images; NaN where unknown.
-    valid: bool (N,), False where no step was made.
-    uncertainty: float32 (N,), >= 0.
-    goals: uint8 (N, H, W, 3), or None without goals. goal_found: bool (N,); None means all found.
-    golden: uint8 (N, K, H, W, 3), the golden trajectory from its first frame to the goal, the goal repeated at the end;
-        golden_lengths: int (N,), frames that count, 2 to K. Only the progress mode reads them.
-    """
+    """One step of N environments: the images before and after it, and what is known about the image after it."""
 
     images: UInt8Array
+    """uint8 (N, H, W, 3), before the step."""
     next_images: UInt8Array
+    """uint8 (N, H, W, 3), after it."""
     success_probability: FloatArray
+    """float32 (N,), done signal on next_images; NaN where unknown."""
     valid: BoolArray
+    """bool (N,), False where no step was made."""
     uncertainty: FloatArray
+    """float32 (N,), >= 0."""
     goals: UInt8Array | None = None
+    """uint8 (N, H, W, 3), or None without goals."""
     goal_found: BoolArray | None = None
+    """bool (N,); None means all found."""
     golden: UInt8Array | None = None
+    """uint8 (N, K, H, W, 3), the golden trajectory from its first frame to the goal, the goal repeated at the end; only
+    the progress mode reads it."""
     golden_lengths: NDArray[np.int64] | None = None
+    """int (N,), frames of golden that count, 2 to K; only the progress mode reads them."""
 
     def __post_init__(self) -> None:
         count = len(self.images)
@@ -60,22 +61,24 @@ class RewardInput:
 
 @dataclass(frozen=True)
 class RewardResult:
-    """The rewards of one step of N environments; all arrays (N,).
-
-    total: float32, the sum of the components. dense, sparse: float32, weighted. All three are NaN where valid is False.
-    success: uint8, SUCCESS_NO, SUCCESS_YES or SUCCESS_UNKNOWN.
-    invalid_reason: "" when every made step has a reward; steps not made (input valid=False) need no reason.
-    components: weighted, by name; weights: by the same names.
-    """
+    """The rewards of one step of N environments; all arrays (N,)."""
 
     total: FloatArray
+    """float32, the sum of the components; NaN where valid is False."""
     dense: FloatArray
+    """float32, weighted; NaN where valid is False."""
     sparse: FloatArray
+    """float32, weighted; NaN where valid is False."""
     valid: BoolArray
+    """bool, True where there is a reward."""
     success: NDArray[np.uint8]
+    """uint8, SUCCESS_NO, SUCCESS_YES or SUCCESS_UNKNOWN."""
     invalid_reason: str = ""
+    """Empty when every made step has a reward; steps not made (input valid=False) need no reason."""
     components: Mapping[str, FloatArray] = field(default_factory=dict)
+    """Weighted, by name."""
     weights: Mapping[str, float] = field(default_factory=dict)
+    """By the names of the components."""
 
 
 class RewardModel(Protocol):

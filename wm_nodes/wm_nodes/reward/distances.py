@@ -44,15 +44,16 @@ pixel_l1: Distance = _PixelL1()
 class EncoderDistance:
     """Mean absolute difference of encoder features, divided by `scale`.
 
-    encoder: uint8 tensor (N, H, W, 3) -> (N, F). scale: the distance that counts as 1.
-    identity: names the encoder, e.g. the start of its sha256.
     Features of the last CACHED_IMAGES images are kept: goals come back every step, and one step's image is the next
     step's first.
     """
 
     encoder: Callable[[Tensor], Tensor]
+    """uint8 tensor (N, H, W, 3) -> (N, F)."""
     scale: float = 1.0
+    """The distance that counts as 1."""
     identity: str = ""
+    """Names the encoder, e.g. the start of its sha256."""
     _known: dict[bytes, Tensor] = field(default_factory=dict, repr=False, compare=False)
 
     def __post_init__(self) -> None:

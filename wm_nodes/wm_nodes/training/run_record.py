@@ -33,6 +33,7 @@ class Starter(Generic[Config]):
     """A command or a launch file that begins runs and goes on with them."""
 
     name: str
+    """Of the command or the launch file."""
     load: Callable[[str, dict[str, Any], Mapping[str, Any]], Config]
     """(preset or YAML file, dotted settings, options) -> configuration."""
     fixed: Mapping[str, Any]

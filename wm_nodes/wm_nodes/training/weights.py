@@ -25,12 +25,16 @@ class WeightsError(ValueError):
 
 @dataclass(frozen=True)
 class PackedWeights:
-    """data: the safetensors file. sha256: of data. arch_hash: see arch_hash()."""
+    """The weights of a module as one file."""
 
     data: bytes
+    """The safetensors file."""
     sha256: str
+    """Of data."""
     arch_hash: str
+    """See arch_hash()."""
     metadata: Mapping[str, str]
+    """Texts inside the file, by name; arch_hash is one of them."""
 
 
 def arch_hash(tensors: Mapping[str, Tensor]) -> str:

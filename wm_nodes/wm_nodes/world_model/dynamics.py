@@ -24,13 +24,14 @@ Caches = list[TemporalCache] | list[RingCache]
 
 @dataclass(frozen=True)
 class Prediction:
-    """change_BTSD: added to the latents of frame t to give frame t + 1, before normalisation.
-    positions_BTQ: of frame t + 1, in the probe's units (zero mean, unit variance). done_logits_BTKJ: of frame t + 1,
-    per head and task."""
+    """What the model says of frame t + 1, for each frame t."""
 
     change_BTSD: Tensor
+    """Added to the latents of frame t to give frame t + 1, before normalisation."""
     positions_BTQ: Tensor
+    """Of frame t + 1, in the probe's units (zero mean, unit variance)."""
     done_logits_BTKJ: Tensor
+    """Of frame t + 1, per head and task."""
 
 
 class DoneHeads(nn.Module):

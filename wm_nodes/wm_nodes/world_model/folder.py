@@ -41,18 +41,23 @@ FORMAT = 2
 
 @dataclass(frozen=True)
 class WorldModels:
-    """tokenizer: with the decoder of rollouts, where the folder has one. tasks: the done head's outputs, in order. text
-    is None where no text model was trained. spec: of one of the environments that the model was trained on, see
-    core.specs.tool_spec; those of its other tasks differ in task, instruction and ground truth alone. probe: the
-    judge's, None where the model was saved without it."""
+    """The networks of a world-model folder, and what they were trained on."""
 
     tokenizer: Tokenizer
+    """With the decoder of rollouts, where the folder has one."""
     action: ActionModel | TokenActionModel
+    """Of tokens where the tokenizer is lfq, else of continuous latents."""
     text: TextModel | None
+    """None where no text model was trained."""
     tasks: tuple[str, ...]
+    """The done head's outputs, in order."""
     spec: EnvironmentSpec
+    """Of one of the environments that the model was trained on, see core.specs.tool_spec; those of its other tasks
+    differ in task, instruction and ground truth alone."""
     manifest: Mapping[str, Any]
+    """Says how they were made; holds their checksums."""
     probe: PositionProbe | None = None
+    """The judge's; None where the model was saved without it."""
 
     @property
     def sha256(self) -> str:

@@ -96,15 +96,14 @@ def vocabulary_of(instructions: tuple[str, ...]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class ImaginedGoals:
-    """Golden trajectories of B first frames.
-
-    frames: uint8 (B, T + 1, H, W, 3), from the first frame. lengths: int64 (B,), frames up to and with the goal.
-    found: bool (B,), whether the done signal crossed the threshold; else the goal is the frame of the highest signal.
-    """
+    """Golden trajectories of B first frames."""
 
     frames: UInt8Array
+    """uint8 (B, T + 1, H, W, 3), from the first frame."""
     lengths: np.ndarray[tuple[int], np.dtype[np.int64]]
+    """int64 (B,), frames up to and with the goal."""
     found: BoolArray
+    """bool (B,), whether the done signal crossed the threshold; else the goal is the frame of the highest signal."""
 
     @property
     def goals(self) -> UInt8Array:

@@ -35,10 +35,13 @@ class ServedModel:
     """A model that our judge can ask."""
 
     name: str
+    """Of its repository on Hugging Face."""
     memory_gb: int
     """Of GPUs, all together: weights, and 2 to 6 GB for images and cache."""
     about: str
+    """What it is good for, a phrase."""
     num_gpus: int = 1
+    """Over which vLLM splits it."""
     flags: tuple[str, ...] = ()
     """Besides those that every line has."""
     settings: dict[str, Any] = field(default_factory=dict)

@@ -26,30 +26,42 @@ class _FrozenModel(BaseModel):
 
 
 class RowLabel(_FrozenModel):
-    """answer: of one row. level: where a person gave one. explanation: whether the judge's reason is right."""
+    """What one person said of one row."""
 
     answer: Literal["pass", "fail", "unsure"]
+    """Of the row."""
     level: Annotated[int, Field(ge=0, lt=NUM_LEVELS)] | None = None
+    """Where the person gave one, from 0."""
     explanation: bool | None = None
+    """Whether the judge's reason is right; None: not said."""
 
 
 class ClipLabel(_FrozenModel):
-    """rows: by component, "planning", "overall" or "hack: PATTERN". evaluation: line of the log."""
+    """What one person said of one clip."""
 
     evaluation: int
+    """Line of the log."""
     sha256: str
+    """Of the clip."""
     audit_id: str
+    """Of the verdict."""
     rows: dict[str, RowLabel]
+    """By component, "planning", "overall" or "hack: PATTERN"."""
 
 
 class HumanLabels(_FrozenModel):
-    """What one person said of the clips of one page. head: hash of the log's last line when the page was written."""
+    """What one person said of the clips of one page."""
 
     format: Literal["audit-labels-1"]
+    """Name and version of the file's format."""
     head: str
+    """Hash of the log's last line when the page was written."""
     annotator: Annotated[str, Field(min_length=1)]
+    """Name of the person."""
     exported: str
+    """Time of the export, ISO 8601, UTC."""
     labels: tuple[ClipLabel, ...]
+    """One per clip that has any."""
 
 
 def read_labels(path: Path) -> HumanLabels:

@@ -45,21 +45,26 @@ DECODED_FRAMES = 2
 
 @dataclass(frozen=True)
 class LatentEpisodes:
-    """Tokenised episodes.
-
-    latents: float16 (E, T + 1, S, D). mean_change_S: float32 (S,), mean absolute change of each token since the first
-    frame. images, states, actions, success, labelled, step_mask: as in EpisodeArrays. truth: float32 (E, T + 1, P), m.
-    """
+    """Tokenised episodes."""
 
     images: Tensor
+    """(E, T + 1, H, W, 3), as in EpisodeArrays."""
     latents: Tensor
+    """float16 (E, T + 1, S, D)."""
     mean_change_S: Tensor
+    """float32 (S,), mean absolute change of each token since the first frame."""
     states: Tensor
+    """(E, T + 1, S), as in EpisodeArrays."""
     actions: Tensor
+    """(E, T, A), as in EpisodeArrays."""
     success: Tensor
+    """(E, T + 1, J), as in EpisodeArrays."""
     labelled: Tensor
+    """(E, J), as in EpisodeArrays."""
     truth: Tensor
+    """float32 (E, T + 1, P), m."""
     step_mask: Tensor
+    """(E, T), as in EpisodeArrays."""
 
     def __len__(self) -> int:
         return len(self.latents)
@@ -77,12 +82,14 @@ class LatentEpisodes:
 
 @dataclass(frozen=True)
 class RolloutTerms:
-    """Predictions of frames 1..T: next_latents (B, T, S, D), positions (B, T, P) in the probe's units, done_logits
-    (B, T, K, J)."""
+    """Predictions of frames 1..T."""
 
     next_latents: Tensor
+    """(B, T, S, D)."""
     positions: Tensor
+    """(B, T, P) in the probe's units."""
     done_logits: Tensor
+    """(B, T, K, J)."""
 
 
 def tokenise_episodes(tokenizer: Tokenizer, episodes: EpisodeArrays) -> LatentEpisodes:

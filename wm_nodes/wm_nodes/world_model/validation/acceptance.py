@@ -43,18 +43,19 @@ MARKS = {"passed": "[green]passed", "failed": "[red]failed[/]: {}", "undecided":
 
 @dataclass(frozen=True)
 class Criterion:
-    """One number that a model is judged by."""
+    """One number of a world model, and whether it is good enough."""
 
     name: str
-    """What was measured."""
+    """What is measured."""
     value: float
     """NaN where it could not be computed."""
     threshold: float | None
     """None where `rule` says everything."""
     rule: str
-    """How value and threshold are compared."""
+    """How value must compare with threshold."""
     outcome: Outcome
-    """Of value against threshold; undecided: there are too few episodes to pass or to fail the model."""
+    """Of value against threshold, as `rule` says; undecided: there are too few episodes to pass or to fail the
+    model."""
     remedy: str
     """What to do where it failed."""
     interval: tuple[float, float] | None = None
@@ -77,14 +78,14 @@ class CloneRollouts:
 
 @dataclass(frozen=True)
 class AcceptanceReport:
-    """Whether a model passes, and by what."""
+    """Whether a world model may be trained in, criterion by criterion."""
 
     task: str
-    """That the model is judged for."""
+    """The task that it was judged for."""
     episodes: int
-    """Held-out ones, or parts of them."""
+    """Held-out episodes, or parts of them; 0 where the frames were not judged."""
     criteria: tuple[Criterion, ...]
-    """What decides."""
+    """All that were judged."""
     metrics: dict[str, float]
     """Every number of the rollouts, by the names in docs/metrics.md and of pictures.picture_metrics."""
     notes: tuple[str, ...] = ()
