@@ -32,9 +32,9 @@ class EnvironmentSpec:
     """What an environment is; see msgs_schema/msg/EnvSpec.msg, field by field."""
 
     env_id: str
-    """E.g. wm/push_cube or maniskill/push_cube."""
+    """E.g. wm/reach or gymnasium/Pendulum-v1."""
     task: str
-    """E.g. push_cube."""
+    """E.g. reach."""
     instruction: str
     """The task in natural language."""
     source: int
