@@ -106,7 +106,7 @@ class Bag:
         if choice not in names:
             raise BagError(
                 f"bag {self.path} has no {choice}{suffix}; environments recorded: {names or 'none'}; "
-                f"topics: {sorted({c.topic for c in self.connections})}"
+                f"topics: {sorted({c.topic for c in self.connections})}; plain bags of a robot: wm import rosbag"
             )
         return choice
 
