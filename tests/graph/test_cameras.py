@@ -108,6 +108,7 @@ def test_a_still_camera_has_a_latched_frame_and_a_moving_one_that_of_each_observ
         np.testing.assert_allclose(pose_of(message)[:3, 2], np.array([0, 1, -1]) / 2**0.5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_recorder_takes_the_topics_of_a_camera_when_it_is_told_to(client: Client, graph: Graph) -> None:
     names = ["env/camera/top/camera_info", "env/camera/top/transform", "env/camera/top/image_raw"]
     recorder = graph.start("recorder", topics=json.dumps(["env/spec", *names]))

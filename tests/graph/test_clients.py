@@ -44,6 +44,7 @@ def other(domain: int) -> Iterator[Probe]:
     probe.close()
 
 
+@pytest.mark.slow
 def test_a_lost_result_of_a_goal_is_asked_for_again(probe: Probe, other: Probe) -> None:
     server = LossyServer(other.node, lost=2)
     handle = probe.send(probe.action(Train, "train"), Train.Goal(updates=5))

@@ -104,6 +104,7 @@ BAD_REQUESTS: list[tuple[Callable[[Client, bool], tuple[Any, str, Any]], str, st
 ]
 
 
+@pytest.mark.slow
 def test_a_bad_request_is_answered_and_counted_a_good_one_served_and_training_goes_on(
     graph: Graph, probe: Probe
 ) -> None:

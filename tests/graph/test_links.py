@@ -35,6 +35,7 @@ def test_a_recorder_that_starts_last_has_every_message_of_the_first_rollout(grap
     assert counts == {"env/image": STEPS + 1, "env/transition": STEPS + 1, "action": STEPS, "env/spec": 1}
 
 
+@pytest.mark.slow
 def test_what_concerns_one_observation_has_its_wall_time_on_every_topic(graph: Graph, probe: Probe) -> None:
     graph.start_environment()
     graph.start("recorder")

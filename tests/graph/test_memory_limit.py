@@ -39,6 +39,7 @@ def most_gib(pid: int) -> float:
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 2**20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("executor", ["events", "single", "multi"])
 def test_a_flood_of_requests_that_claim_gigabytes_leaves_the_node_below_its_limit_and_answering(
     graph: Graph, probe: Probe, executor: str

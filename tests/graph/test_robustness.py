@@ -45,6 +45,7 @@ def cycle(probe: Probe, node: str) -> None:
         assert probe.call(ChangeState, f"{node}/change_state", request).success, f"{node}: transition {transition}"
 
 
+@pytest.mark.slow
 def test_an_environment_cleaned_up_and_configured_again_has_a_new_session_and_trains_the_same_weights(
     graph: Graph, probe: Probe
 ) -> None:
@@ -106,6 +107,7 @@ def test_an_environment_that_fails_in_a_reset_says_so_in_the_answer_and_can_be_r
     client.reset()
 
 
+@pytest.mark.slow
 def test_an_unexpected_exception_in_a_timer_ends_the_node_in_order(graph: Graph, probe: Probe) -> None:
     states = probe.listen("run/state")
     program = [sys.executable, "-m", "failing_node", "--ros-args", "-r", "__ns:=/wm"]
@@ -116,6 +118,7 @@ def test_an_unexpected_exception_in_a_timer_ends_the_node_in_order(graph: Graph,
     wait_until("FAILED", lambda: any(s.state == s.FAILED for s in states))
 
 
+@pytest.mark.slow
 def test_transitions_without_images_are_declared_invalid_although_the_simulated_clock_stands(
     graph: Graph, probe: Probe
 ) -> None:
@@ -143,6 +146,7 @@ def full_disk(process: subprocess.Popen[bytes], limit_bytes: float = resource.RL
     resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (int(limit_bytes), resource.RLIM_INFINITY))
 
 
+@pytest.mark.slow
 def test_a_full_disk_stops_recording_with_one_error_nothing_flushed_is_lost_and_the_node_lives_on(
     graph: Graph, probe: Probe
 ) -> None:
@@ -198,6 +202,7 @@ def _count(folder: Path, topic: str) -> int:
             return 0
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_training_as_failed_with_one_error_and_the_last_checkpoint_loads(
     graph: Graph, probe: Probe
 ) -> None:
@@ -224,6 +229,7 @@ def test_a_full_disk_ends_training_as_failed_with_one_error_and_the_last_checkpo
     toy.assert_trained_in_one_process(graph.folder / "policies" / "policy_000004.safetensors", updates=3)
 
 
+@pytest.mark.slow
 def test_the_main_job_without_a_renderer_ends_with_one_line(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

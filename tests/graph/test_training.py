@@ -53,6 +53,7 @@ def test_two_updates_run_end_to_end_and_leave_versions_metrics_and_a_checkpoint(
     assert (again.policy_version, again.updates) == (4, 3)
 
 
+@pytest.mark.slow
 def test_a_late_joiner_gets_the_newest_version_inline_and_in_chunks(graph: Graph, probe: Probe) -> None:
     graph.start_training_nodes()
     train(probe, updates=1)
@@ -93,6 +94,7 @@ def _run(folder: Path, updates: int, *, forks: bool = True, settings: dict[str, 
     return weights_in(folder)
 
 
+@pytest.mark.slow
 def test_two_runs_with_one_seed_give_bit_equal_weights_and_a_resumed_run_the_same(tmp_path: Path) -> None:
     first, second = _run(tmp_path / "a", 3), _run(tmp_path / "b", 3, forks=False)
     assert first == second
@@ -101,6 +103,7 @@ def test_two_runs_with_one_seed_give_bit_equal_weights_and_a_resumed_run_the_sam
     assert _run(tmp_path / "c", 2) == first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{}, GROUPS], ids=["gae", "group"])
 def test_the_graph_gives_the_weights_of_policy_rl_train_bit_for_bit(settings: dict[str, Any], tmp_path: Path) -> None:
     graph_weights = _run(tmp_path / "graph", 2, settings=settings)
@@ -109,6 +112,7 @@ def test_the_graph_gives_the_weights_of_policy_rl_train_bit_for_bit(settings: di
     toy.assert_trained_in_one_process(file, updates=2, settings=settings)
 
 
+@pytest.mark.slow
 def test_a_learner_that_is_not_ppo_trains_and_resumes_over_dds_as_in_one_process(tmp_path: Path) -> None:
     for updates in (2, 1):
         _run(tmp_path, updates, settings={"learner.factory": "reinforce:make_reinforce"})
@@ -132,6 +136,7 @@ def recorded_training(graph: Graph, probe: Probe, updates: int) -> Path:
     return graph.folder / stopped.bag_uri
 
 
+@pytest.mark.slow
 def test_training_from_the_bag_and_from_its_replay_gives_the_weights_of_the_live_training(
     graph: Graph, probe: Probe
 ) -> None:
@@ -156,6 +161,7 @@ def test_training_from_the_bag_and_from_its_replay_gives_the_weights_of_the_live
                 offline.stop()
 
 
+@pytest.mark.slow
 def test_a_recording_or_an_environment_of_another_camera_ends_the_goal_with_both_cameras_named(
     graph: Graph, probe: Probe, tmp_path: Path
 ) -> None:
@@ -220,6 +226,7 @@ def test_a_replay_that_starts_with_the_learner_trains_and_a_short_one_says_so(gr
             short.stop()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("goal", "text"),
     [
@@ -235,6 +242,7 @@ def test_a_goal_that_asks_for_nothing_is_refused(graph: Graph, probe: Probe, goa
     assert text in result.message
 
 
+@pytest.mark.slow
 @pytest.mark.kills  # torchrun answers SIGINT with a non-zero code
 def test_two_ranks_under_torchrun_give_the_update_of_one(graph: Graph, probe: Probe) -> None:
     torchrun = ("-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", str(29500 + graph.domain))
@@ -260,6 +268,7 @@ def test_cancel_ends_training_within_a_second_and_the_next_goal_works(graph: Gra
     assert train(probe, updates=1).termination_reason == Train.Result.FINISHED
 
 
+@pytest.mark.slow
 def test_a_deactivated_learner_ends_its_goal_with_that_reason(graph: Graph, probe: Probe) -> None:
     graph.start_training_nodes()
     updates: list[Any] = []

@@ -12,6 +12,7 @@ from wm_nodes.video_rl.sampling import recorded_place
 pytestmark = pytest.mark.graph
 
 
+@pytest.mark.slow
 def test_the_graph_trains_on_self_made_histories_as_one_process_does_bit_for_bit(tmp_path: Path) -> None:
     config = settings(**{
         "groups.history": 1, "model.training.given_frames": 2, "model.training.new_frames": 1, "rollout.num_steps": 4,

@@ -26,6 +26,7 @@ def write_buffers(loop: VideoLoop, rewards: list[float]) -> list[str]:
     return uris
 
 
+@pytest.mark.slow
 def test_a_reward_for_bad_pictures_is_named_in_log_diagnostics_and_metrics_until_it_falls(
     graph: Graph, probe: Probe
 ) -> None:

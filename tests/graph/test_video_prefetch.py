@@ -34,6 +34,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[VideoLoop]:
             graph.stop()
 
 
+@pytest.mark.slow
 def test_prefetching_gives_the_weights_of_the_delayed_loop_and_counts_its_staleness(loop: VideoLoop) -> None:
     clips, versions = loop.probe.listen("clips"), loop.probe.listen("video/version")
     wait_until("matching", lambda: versions and loop.probe.node.count_publishers("/wm/clips"))
@@ -48,6 +49,7 @@ def test_prefetching_gives_the_weights_of_the_delayed_loop_and_counts_its_stalen
     assert began[3] > announced[6], "a goal has asked for more than its own buffers"
 
 
+@pytest.mark.slow
 def test_cancel_leaves_no_goal_under_way(loop: VideoLoop) -> None:
     fed = list[Any]()
     handle = loop.send(100000, fed.append)
@@ -61,6 +63,7 @@ def test_cancel_leaves_no_goal_under_way(loop: VideoLoop) -> None:
     loop.assert_undisturbed(loop.train(2))
 
 
+@pytest.mark.slow
 @pytest.mark.kills
 def test_a_killed_learner_and_video_model_go_on_with_the_version_before(loop: VideoLoop) -> None:
     fed = list[Any]()
@@ -74,6 +77,7 @@ def test_a_killed_learner_and_video_model_go_on_with_the_version_before(loop: Vi
     loop.assert_undisturbed(loop.train(2))
 
 
+@pytest.mark.slow
 @pytest.mark.kills  # torchrun answers SIGINT with a non-zero code
 def test_two_ranks_under_torchrun_go_on_with_the_update_of_one(loop: VideoLoop) -> None:
     loop.stop("video_learner")

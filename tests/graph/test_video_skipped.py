@@ -14,6 +14,7 @@ from wm_nodes.video_rl.grpo import MAX_SKIPPED
 pytestmark = pytest.mark.graph
 
 
+@pytest.mark.slow
 def test_a_buffer_without_spread_is_skipped_and_counted_and_too_many_in_a_row_fail_the_goal(
     graph: Graph, probe: Probe
 ) -> None:

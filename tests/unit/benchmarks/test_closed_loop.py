@@ -134,6 +134,7 @@ def test_arms_cost_the_same_network_calls() -> None:
     assert contexts * (1.0 * 4 + draws * 3) == pytest.approx(576, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_command_trains_every_arm_and_goes_on_where_its_file_stops(
     bag: Path, folder: VideoFolder, tmp_path: Path
 ) -> None:

@@ -107,6 +107,7 @@ def test_what_would_begin_after_the_time_is_left_out_and_listed(
     assert "left out (the 0 minutes were over)" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_was_measured(tmp_path: Path) -> None:
     file = tmp_path / "speed.json"
     program = "import sys; from wm_nodes.apps.cli import main; sys.exit(main(sys.argv[1:]))"

@@ -47,6 +47,7 @@ def said_by(read: Callable[[Path], object], path: Path) -> str:
     return str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [*BROKEN, "folder", "missing"])
 def test_presets_configurations_and_rubrics_say_what_is_wrong_where(kind: str, tmp_path: Path) -> None:
     path = make(tmp_path, kind)

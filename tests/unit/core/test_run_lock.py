@@ -51,6 +51,7 @@ def test_the_file_says_host_process_and_start_and_a_second_process_is_told(tmp_p
         assert held_by(folder).process == os.getpid()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stale", [False, True])
 def test_of_processes_that_start_at_once_exactly_one_gets_the_folder(stale: bool, tmp_path: Path) -> None:
     for race in range(RACES):

@@ -72,6 +72,7 @@ def test_every_episode_that_ends_in_a_bag_is_judged_once_and_paid_at_its_end(
     assert (found.compared, found.different) == (0, [])
 
 
+@pytest.mark.slow
 def test_rewards_that_the_agent_gave_come_out_again_and_one_unit_in_the_last_place_is_found(
     server: PickyServer, tmp_path: Path
 ) -> None:

@@ -71,6 +71,7 @@ def test_a_server_in_which_cuda_runs_says_so_and_does_not_fork(tmp_path: Path, s
     assert output.read_text() == (CUDA_RUNS if started else "node runs\n")
 
 
+@pytest.mark.slow
 def test_a_node_that_came_too_late_is_ended_and_the_next_ones_are_not_taken_for_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -30,6 +30,7 @@ def run_on(device: str, run_dir: Path) -> PolicyTraining:
     )
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_on_the_other_device_as_if_it_had_stayed(device: Device, tmp_path: Path) -> None:
     rollouts = [toy_rollout(toy_policy(), version) for version in range(ROLLOUTS)]
     weights = []

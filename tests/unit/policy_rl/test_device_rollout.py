@@ -206,6 +206,7 @@ def test_what_a_capture_returns_is_what_runs() -> None:
     assert len(runs) == STEPS
 
 
+@pytest.mark.slow
 def test_a_lock_step_is_one_graph_without_breaks() -> None:
     config = config_of()
     collector = DeviceCollector(

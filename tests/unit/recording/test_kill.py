@@ -136,6 +136,7 @@ def test_every_episode_written_before_a_kill_is_recovered(tmp_path: Path) -> Non
     assert (tmp_path / "bag.partial").exists()
 
 
+@pytest.mark.slow
 def test_a_kill_loses_at_most_the_last_second_of_messages(tmp_path: Path) -> None:
     lines = kill_while_it_writes(MESSAGE_WRITER, tmp_path / "bag", 2.5)
     last_number, last_time_ns = map(int, lines[-1].split())

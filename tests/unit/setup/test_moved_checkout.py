@@ -82,6 +82,7 @@ def test_an_environment_elsewhere_follows_the_checkout_that_used_it_last(tmp_pat
     assert SAID in checkout.complete()
 
 
+@pytest.mark.slow
 def test_messages_that_came_along_in_a_copy_are_not_compiled_again_for_an_environment_of_its_own(
     tmp_path: Path, repository: Path
 ) -> None:

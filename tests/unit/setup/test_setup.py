@@ -180,6 +180,7 @@ def test_entry_points_are_readable_for_old_pythons(repository: Path) -> None:
         ast.parse((repository / "launch_scripts" / name).read_text(), feature_version=(3, 8))
 
 
+@pytest.mark.slow
 def test_a_graph_test_that_failed_beside_another_has_to_pass_by_itself_and_others_are_not_repeated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -682,6 +682,7 @@ class TestFolder:
 class TestDevice:
     """Public models on a device as on the CPU."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("kind", ["wan", "cosmos2.5"])
     def test_a_lora_is_trained_by_the_documented_lines_as_on_the_cpu(
         self, device: Device, kind: str, tmp_path: Path

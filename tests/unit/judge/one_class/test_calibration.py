@@ -77,6 +77,7 @@ def test_the_command_makes_a_judge_of_a_world_model(
     assert OneClassJudge(folder).unfit_reason((4, 64, 128, 3)) == ""
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_ranges(few: None) -> None:
     first, again = (calibrate(models(), episodes(), stride=1, seed=0) for _ in range(2))
     assert first == again and first.words == (
@@ -85,6 +86,7 @@ def test_equal_seeds_give_equal_ranges(few: None) -> None:
     assert first.spread["start"] > 0.05, "harmless changes start with another picture than the reference"
 
 
+@pytest.mark.slow
 def test_state_values_that_say_which_task_an_episode_is_of_change_nothing(few: None) -> None:
     coded = [
         replace(episode, states=np.pad(episode.states, ((0, 0), (0, 2)), constant_values=1)) for episode in episodes()
@@ -92,6 +94,7 @@ def test_state_values_that_say_which_task_an_episode_is_of_change_nothing(few: N
     assert calibrate(models(), coded, stride=1, seed=0) == calibrate(models(), episodes(), stride=1, seed=0)
 
 
+@pytest.mark.slow
 def test_cameras_that_move_are_named_and_the_others_stand_still(few: None) -> None:
     assert models().spec.cameras == ("side", "wrist")
     assert calibrate(models(), episodes(), stride=1, seed=0).still == (True, False)
