@@ -9,7 +9,7 @@ from pathlib import Path
 HOLD = """
 import sys, time
 from pathlib import Path
-from wm_nodes.core.run_lock import RunFolderInUseError, RunLock
+from wm_nodes.training.run_lock import RunFolderInUseError, RunLock
 while len(sys.argv) > 2 and not Path(sys.argv[2]).exists():
     time.sleep(0.0005)
 try:

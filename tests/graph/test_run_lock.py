@@ -12,7 +12,7 @@ from graph.launched import PROGRAM, launched
 from run_holders import holder
 
 from wm_msgs.action import Train
-from wm_nodes.core.run_lock import NAME
+from wm_nodes.training.run_lock import NAME
 from wm_nodes.training.run_record import read_record
 
 pytestmark = pytest.mark.graph

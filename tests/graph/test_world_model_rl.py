@@ -24,12 +24,12 @@ from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
-from wm_nodes.core.run_lock import NAME
 from wm_nodes.nodes.video_model_node import film_strip
 from wm_nodes.recording import BagError
 from wm_nodes.recording.bag import Bag
 from wm_nodes.reports.summary import read_summary
 from wm_nodes.training.metrics import read_metrics
+from wm_nodes.training.run_lock import NAME
 from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import load_video_folder

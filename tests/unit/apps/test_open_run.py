@@ -13,7 +13,7 @@ from wm_nodes.apps import train_policy, train_video_model
 from wm_nodes.apps.cli import Parser
 from wm_nodes.config.load import FREE, ConfigError, dump_config, load_config
 from wm_nodes.core.device import DeviceError
-from wm_nodes.core.run_lock import NAME
+from wm_nodes.training.run_lock import NAME
 
 BEGINNING = ["--preset", "smoke", "--ppo.updates", "3", "--seed", "4", "--task", "reach",
              "--model_refresh.num_rounds", "2",

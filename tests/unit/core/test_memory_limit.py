@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from wm_nodes.core.memory_limit import GIB, memory_bytes
+from wm_nodes.core.memory import GIB, memory_bytes
 
 MACHINE = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 TRY = """
 import mmap, sys
-from wm_nodes.core.memory_limit import limit_memory
+from wm_nodes.core.memory import limit_memory
 print(limit_memory(float(sys.argv[1]), int(sys.argv[2])))
 shared = mmap.mmap(-1, 3 * 2**30)
 try:

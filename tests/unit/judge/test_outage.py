@@ -11,8 +11,8 @@ from chat_server import Fault
 from judge_server import PickyServer, serving
 from scripted_judge import make_clip, make_task
 
+from wm_nodes.config.judge import JudgeConfig
 from wm_nodes.config.load import default_judge
-from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.judge.agent.contract import pause_reason
 from wm_nodes.judge.agent.types import Status

@@ -15,8 +15,8 @@ from recording_samples import foreign_copy, make_spec
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from wm_nodes.apps.cli import main
+from wm_nodes.config.judge import JudgeConfig
 from wm_nodes.config.load import default_judge
-from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.judge.rejudge import JudgedBag, judge_bag
 from wm_nodes.judge.service import JudgeService
 from wm_nodes.reward import RewardResult

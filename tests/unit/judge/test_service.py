@@ -21,8 +21,8 @@ from scripted_judge import make_clip, make_task
 from video_toys import changed_judge
 
 from wm_nodes.apps.cli import main
+from wm_nodes.config.judge import JudgeConfig
 from wm_nodes.config.load import default_judge, dump_config, judge_overrides, load_config, load_video_config
-from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.lockstep import LockStep
 from wm_nodes.core.named_files import NamedFiles, OutsideFolders

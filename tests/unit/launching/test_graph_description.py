@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 from run_holders import holder
 
-from wm_nodes.core.run_lock import RunFolderInUseError
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching import launch_description as launch_face
 from wm_nodes.launching.domain_lock import DomainInUseError, DomainLock
@@ -27,6 +26,7 @@ from wm_nodes.launching.scenarios import (
     parse_arguments,
 )
 from wm_nodes.ros.middleware import PROFILE
+from wm_nodes.training.run_lock import RunFolderInUseError
 from wm_nodes.training.run_record import read_record
 from wm_nodes.world_model import load_starts
 

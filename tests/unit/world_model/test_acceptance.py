@@ -19,12 +19,12 @@ from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.validation.acceptance import (
-    AcceptanceReport,
     CloneRollouts,
     accept_world_model,
     accepted_when_made,
     apply_criteria,
 )
+from wm_nodes.world_model.validation.acceptance_report import AcceptanceReport
 
 TASKS = ("reach", "push_cube")
 GOOD = {

@@ -37,7 +37,7 @@ from wm_nodes.training.weights import save_weights
 from wm_nodes.video_model.folder import read_video_manifest
 from wm_nodes.world_model import ImaginedEpisodes
 from wm_nodes.world_model.folder import read_world_manifest
-from wm_nodes.world_model.validation.acceptance import AcceptanceReport
+from wm_nodes.world_model.validation.acceptance_report import AcceptanceReport
 
 WORLD_MODEL, SIMULATOR = "world_model", "simulator"
 SIMULATOR_ENVS, IMAGINED_EPISODES = 8, 256

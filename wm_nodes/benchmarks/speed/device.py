@@ -16,8 +16,8 @@ from benchmarks.speed.device_models import Models, imagination_points, training_
 from benchmarks.speed.device_suite import CPU_PLAN, GPU_PLAN, INTERRUPTED, Plan, Point, Suite, number_text, spread_text
 from wm_nodes.apps.cli import DIFFERENT, DONE
 from wm_nodes.apps.cli import INTERRUPTED as STOPPED
-from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.core.device import CPU, compute_device, device_label
+from wm_nodes.core.memory import keep_freed_memory
 from wm_nodes.reports.console_table import make_table
 
 NO_GPU = "nothing was measured on a GPU"

@@ -20,8 +20,8 @@ import torch
 from benchmarks.experiment import console
 from benchmarks.speed.inputs import Effort, actions_of, interleave, seeds_of
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.core.errors import RunError
+from wm_nodes.core.memory import keep_freed_memory
 from wm_nodes.core.types import Environment
 from wm_nodes.policy_rl.factories import make_endogenous_reward, make_imagined_environment
 from wm_nodes.policy_rl.rollouts import reward_input

@@ -19,7 +19,7 @@ from benchmarks.speed.stages import measure_stages
 from wm_nodes.apps import options
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.core.allocator import keep_freed_memory
+from wm_nodes.core.memory import keep_freed_memory
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.machine import machine_facts
 

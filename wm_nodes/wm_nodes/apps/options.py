@@ -11,8 +11,8 @@ from typing import Any
 import torch
 
 from wm_nodes.config.load import POLICY, VIDEO, Config, judge_overrides, preset_names
-from wm_nodes.core.allocator import keep_freed_memory
-from wm_nodes.core.run_lock import RunLock
+from wm_nodes.core.memory import keep_freed_memory
+from wm_nodes.training.run_lock import RunLock
 from wm_nodes.training.run_record import Starter, take_up
 
 JUDGE = "judge"

@@ -30,7 +30,8 @@ from wm_nodes.recording import read_spec
 from wm_nodes.reports.stages import Stages, console
 from wm_nodes.training.run_record import Starter
 from wm_nodes.world_model.folder import read_world_manifest
-from wm_nodes.world_model.validation.acceptance import AcceptanceReport, report_when_made
+from wm_nodes.world_model.validation.acceptance import report_when_made
+from wm_nodes.world_model.validation.acceptance_report import AcceptanceReport, number_of
 from wm_nodes.world_model.validation.pictures import horizon_table, horizons_of
 
 MODEL = "model"
@@ -123,7 +124,7 @@ def _check_task(given: str, bags: list[Path]) -> None:
 def _judge(config: RunConfig, model: Path) -> AcceptanceReport:
     """Write acceptance.json and print it."""
     manifest = read_world_manifest(model)
-    metrics = {name: float("nan") if value is None else float(value) for name, value in manifest["heldout"].items()}
+    metrics = {name: number_of(value) for name, value in manifest["heldout"].items()}
     report = replace(report_when_made(manifest, config), metrics=metrics)
     write_atomic(model / ACCEPTANCE, json.dumps(report.to_dict(), indent=1).encode())
     console.print(report.table())

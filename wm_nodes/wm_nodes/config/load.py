@@ -14,7 +14,8 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import ValidationError
 
-from wm_nodes.config.schema import AGENT, JudgeConfig, RunConfig
+from wm_nodes.config.judge import JudgeConfig
+from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.sections import SettingsSection
 from wm_nodes.config.tasks import get_task, task_names
 from wm_nodes.config.video import VideoRlConfig

@@ -19,7 +19,7 @@ def _module_and_callable(text: str) -> str:
 
 
 FactoryName = Annotated[str, AfterValidator(lambda text: text and _module_and_callable(text))]
-"""module:callable of a package on PYTHONPATH, see core/factory.py; or empty."""
+"""module:callable of a package on PYTHONPATH, see core/imports.py; or empty."""
 EnvironmentName = Annotated[
     str, AfterValidator(lambda text: text if text.isidentifier() else _module_and_callable(text))
 ]

@@ -4,7 +4,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from wm_nodes.config.schema import AGENT, DeviceName, JudgeConfig, TaskName
+from wm_nodes.config.judge import JudgeConfig
+from wm_nodes.config.schema import AGENT, DeviceName, TaskName
 from wm_nodes.config.sections import (
     Fraction,
     NonNegativeFloat,

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import has_simulator
-from wm_nodes.core.factory import load_factory
+from wm_nodes.core.imports import load_factory
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Environment
 from wm_nodes.environments.maniskill.spec import simulation_spec

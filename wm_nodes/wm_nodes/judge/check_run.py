@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from wm_nodes.config.schema import JudgeConfig
+from wm_nodes.config.judge import JudgeConfig
 from wm_nodes.core.device import CPU
 from wm_nodes.judge.agent.judge import Capabilities, Health, Judge, JudgeError, Read, ReadRequest
 from wm_nodes.judge.agent.levels import first_vote, next_vote

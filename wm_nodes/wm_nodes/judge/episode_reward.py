@@ -14,8 +14,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from wm_nodes.config.judge import JudgeConfig
 from wm_nodes.config.load import judge_or_embedded
-from wm_nodes.config.schema import AGENT, JudgeConfig, RunConfig
+from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.core.lockstep import LockStep
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import BoolArray, FloatArray, Rollout, UInt8Array

@@ -19,7 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wm_nodes.config.schema import AGENT, JudgeConfig
+from wm_nodes.config.judge import JudgeConfig
+from wm_nodes.config.schema import AGENT
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import CPU
 from wm_nodes.core.named_files import RUBRIC, NamedFiles

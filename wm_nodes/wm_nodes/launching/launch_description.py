@@ -11,11 +11,11 @@ import subprocess
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from wm_nodes.core.run_lock import RunLock
 from wm_nodes.launching.domain_lock import DomainLock
 from wm_nodes.launching.environment import graph_environment, interpreter
 from wm_nodes.launching.graph import RESPAWN_S, Graph, NodeSpec
 from wm_nodes.launching.scenarios import argument_table, is_setting, parse_arguments, run_folder
+from wm_nodes.training.run_lock import RunLock
 
 LOCKS: list[DomainLock] = []
 """Of the graphs that this process launched, until it ends: ros2 launch runs nothing of ours at its own end."""

@@ -17,7 +17,6 @@ from types import FrameType
 from typing import TextIO
 
 from wm_nodes.core.errors import RunError
-from wm_nodes.core.run_lock import RunLock
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.domain_lock import DomainInUseError, DomainLock
 from wm_nodes.launching.environment import graph_environment, interpreter
@@ -27,6 +26,7 @@ from wm_nodes.launching.process import NodeProcess
 from wm_nodes.launching.readiness import NotReadyError, activate, wait_ready
 from wm_nodes.launching.scenarios import describe_arguments, parse_arguments, run_folder
 from wm_nodes.ros.middleware import PROFILE, PROFILE_VARIABLE, SEGMENT_BYTES
+from wm_nodes.training.run_lock import RunLock
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 LAST_OUTPUT_S = 0.2

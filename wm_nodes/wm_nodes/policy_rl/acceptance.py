@@ -13,13 +13,13 @@ from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.starts import load_start_seeds
 from wm_nodes.world_model.validation.acceptance import (
-    AcceptanceReport,
     CloneRollouts,
     accept_video_model,
     accept_world_model,
     accepted_when_made,
     report_when_made,
 )
+from wm_nodes.world_model.validation.acceptance_report import AcceptanceReport
 
 
 def accept_model(

@@ -18,7 +18,7 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import has_simulator
 from wm_nodes.core.cameras import CameraModel
 from wm_nodes.core.device import CPU, compute_device, explain_memory
-from wm_nodes.core.factory import load_factory
+from wm_nodes.core.imports import load_factory
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import MODEL_FIELDS, EnvironmentSpec, agree, tool_spec
 from wm_nodes.core.types import Environment, FloatArray, Observation, UInt8Array

@@ -23,8 +23,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from wm_nodes.config.load import ConfigError, read_yaml
-from wm_nodes.core.allocator import keep_freed_memory
-from wm_nodes.core.memory_limit import limit_memory
+from wm_nodes.core.memory import keep_freed_memory, limit_memory
 from wm_nodes.ros.middleware import set_node_defaults
 
 EXECUTORS = ("events", "single", "multi")

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
+from wm_nodes.core.imports import optional_package
 from wm_nodes.core.model_folder import ModelFolderError
-from wm_nodes.core.optional import optional_package
 from wm_nodes.world_model.conditions import text_rows, word_mask
 
 UNUSED = ("decoder.", "pooler.")

@@ -10,8 +10,8 @@ import pytest
 from judge_server import PickyServer, serving
 from scripted_judge import CLEAN, COOKING, WRONG, ScriptedJudge, clean_table, make_clip, make_task
 
+from wm_nodes.config.judge import JudgeConfig
 from wm_nodes.config.load import ConfigError, default_judge, load_config
-from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.judge.agent.judge import Capabilities, Judge, Read, ReadRequest
 from wm_nodes.judge.agent.levels import next_vote
 from wm_nodes.judge.agent.machine import RewardAgent

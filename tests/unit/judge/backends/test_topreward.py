@@ -14,8 +14,8 @@ from judge_server import serving
 from scripted_judge import make_clip, make_task
 
 from wm_nodes.apps.cli import main
+from wm_nodes.config.judge import JudgeConfig
 from wm_nodes.config.load import default_judge
-from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.judge.agent import topreward
 from wm_nodes.judge.agent.types import Stage, Status
 from wm_nodes.judge.agent.verdict import Verdict

@@ -16,7 +16,7 @@ import pytest
 from chat_server import ChatServer, Fault
 from deadlines import within
 
-from wm_nodes.core.optional import MissingPackageError
+from wm_nodes.core.imports import MissingPackageError
 from wm_nodes.judge.backends.answer_limit import ANSWER_BYTES
 from wm_nodes.judge.backends.limits import AdaptiveLimit, Admission, CircuitBreaker
 from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy, TransportError, retry_after_s

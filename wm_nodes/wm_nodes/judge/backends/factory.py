@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from wm_nodes.config.schema import JudgeConfig, StageJudge
+from wm_nodes.config.judge import JudgeConfig, StageJudge
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.device import CPU
 from wm_nodes.judge.agent import topreward

@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 
 from pydantic import ValidationError
 
-from wm_nodes.core.optional import optional_package
+from wm_nodes.core.imports import optional_package
 from wm_nodes.judge.backends.limits import AdaptiveLimit, Admission, CircuitBreaker
 from wm_nodes.judge.backends.protocol import Completion
 

@@ -13,8 +13,9 @@ from typing import Any
 from wm_msgs.action import JudgeClips
 from wm_msgs.msg import ClipVerdict, ErrorCode
 from wm_msgs.srv import SetRubric
+from wm_nodes.config.judge import JudgeConfig
 from wm_nodes.config.load import ConfigError
-from wm_nodes.config.schema import JudgeConfig, RunConfig
+from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.errors import WireError
 from wm_nodes.core.named_files import FileKind, shown

@@ -9,7 +9,6 @@ from typing import Any
 
 from wm_msgs.msg import PolicyVersion
 from wm_nodes.core.errors import WireError
-from wm_nodes.core.run_lock import RunLock
 from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.ros import convert
 from wm_nodes.ros.actions import WorkerAction
@@ -20,6 +19,7 @@ from wm_nodes.ros.wire import PeerLost
 from wm_nodes.ros.worker import Work
 from wm_nodes.training.ranks import Ranks, join
 from wm_nodes.training.run_folder import TrainingRun
+from wm_nodes.training.run_lock import RunLock
 
 
 class TrainingNode(ManagedNode):

@@ -9,7 +9,7 @@ in no diffusers folder. WanVelocity takes any module with the call of WanTransfo
 published network is all that is missing, beside its text encoder (last hidden states of Qwen2.5-VL).
 """
 
-from wm_nodes.core.optional import MissingPackageError
+from wm_nodes.core.imports import MissingPackageError
 from wm_nodes.video_model.adapters.codec import VideoCodec
 from wm_nodes.video_model.adapters.cosmos import CosmosVelocity
 from wm_nodes.video_model.adapters.folder import ModelFolder

@@ -2,6 +2,6 @@
 
 from functools import partial
 
-from wm_nodes.core.optional import optional_package
+from wm_nodes.core.imports import optional_package
 
 package = partial(optional_package, needed_by="public video models need", requirements="video.txt")

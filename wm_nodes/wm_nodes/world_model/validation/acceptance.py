@@ -8,25 +8,23 @@ instead. Those of the policy come from rollouts of its own (policy_rl/acceptance
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import parts_of
 from wm_nodes.core.statistics import newcombe_difference, wilson_of_share
 from wm_nodes.core.types import BoolArray
 from wm_nodes.recording.episode_arrays import EpisodeArrays
-from wm_nodes.reports.console_table import make_table
 from wm_nodes.world_model import WorldModels
 from wm_nodes.world_model.positions import judged_things
+from wm_nodes.world_model.validation.acceptance_report import AcceptanceReport, Criterion, Outcome, at_step, number_of
 from wm_nodes.world_model.validation.goals import goal_metrics
 from wm_nodes.world_model.validation.open_loop import MOVED_M, evaluate_rollouts
 from wm_nodes.world_model.validation.pictures import judged_horizon, picture_metrics
 
-Outcome = Literal["passed", "failed", "undecided"]
 MORE_TRAINING = (
     "train longer (world_model.num_iterations) or on more episodes near contact (data.num_episodes, data.behaviours)"
 )
@@ -38,32 +36,6 @@ RECORDED_SUCCESSES = "record more episodes that succeed, or lower reward.success
 OTHER_ACTIONS = "record episodes in which the robot does different things from alike first frames, or train longer"
 POLICY_DATA = "refresh the model with more episodes of weak policies (data.policy_episodes)"
 BETTER_GOALS = "train the text model longer (world_model.text_num_iterations), or set reward.dense_weight to 0"
-MARKS = {"passed": "[green]passed", "failed": "[red]failed[/]: {}", "undecided": "[yellow]too few episodes"}
-
-
-@dataclass(frozen=True)
-class Criterion:
-    """One number of a world model, and whether it is good enough."""
-
-    name: str
-    """What is measured."""
-    value: float
-    """NaN where it could not be computed."""
-    threshold: float | None
-    """None where `rule` says everything."""
-    rule: str
-    """How value must compare with threshold."""
-    outcome: Outcome
-    """Of value against threshold, as `rule` says; undecided: there are too few episodes to pass or to fail the
-    model."""
-    remedy: str
-    """What to do where it failed."""
-    interval: tuple[float, float] | None = None
-    """95 %, of the value; None where it is not known."""
-
-    @property
-    def passed(self) -> bool:
-        return self.outcome == "passed"
 
 
 @dataclass(frozen=True)
@@ -74,75 +46,6 @@ class CloneRollouts:
     """(E,), success by the model's own done signal."""
     replayed: BoolArray
     """(E,), success by the simulator, under the same actions."""
-
-
-@dataclass(frozen=True)
-class AcceptanceReport:
-    """Whether a world model may be trained in, criterion by criterion."""
-
-    task: str
-    """The task that it was judged for."""
-    episodes: int
-    """Held-out episodes, or parts of them; 0 where the frames were not judged."""
-    criteria: tuple[Criterion, ...]
-    """All that were judged."""
-    metrics: dict[str, float]
-    """Every number of the rollouts, by the names in docs/metrics.md and of pictures.picture_metrics."""
-    notes: tuple[str, ...] = ()
-    """What was measured and left out, and what could not be judged."""
-
-    @property
-    def outcome(self) -> Outcome:
-        """failed: in any criterion; else undecided: in any, or there is none."""
-        found = {criterion.outcome for criterion in self.criteria}
-        return "failed" if "failed" in found else "undecided" if "undecided" in found or not found else "passed"
-
-    @property
-    def passed(self) -> bool:
-        return self.outcome == "passed"
-
-    @property
-    def failed(self) -> tuple[str, ...]:
-        return self._with("failed")
-
-    @property
-    def undecided(self) -> tuple[str, ...]:
-        return self._with("undecided")
-
-    def _with(self, outcome: Outcome) -> tuple[str, ...]:
-        return tuple(criterion.name for criterion in self.criteria if criterion.outcome == outcome)
-
-    @property
-    def words(self) -> str:
-        """The outcome and which criteria it is due to, in a line."""
-        names = self.failed or self.undecided
-        return " ".join([self.outcome, *([f"({', '.join(names)})"] if names else [])])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, numbers that are not finite as None; with `outcome`, `passed`, `failed`,
-        `undecided`."""
-        values = asdict(self)
-        values["criteria"] = [
-            {**row, "value": _finite(row["value"]), "passed": row["outcome"] == "passed"} for row in values["criteria"]
-        ]
-        values["metrics"] = {name: _finite(value) for name, value in self.metrics.items()}
-        return {
-            **values, "outcome": self.outcome, "passed": self.passed, "failed": list(self.failed),
-            "undecided": list(self.undecided),
-        }
-
-    def table(self) -> Table:
-        """The criteria for the terminal; remedies where they failed."""
-        words = self.outcome.upper() if self.failed else self.outcome
-        rows = []
-        for row in self.criteria:
-            limit = "" if row.threshold is None else f" {row.threshold:g}"
-            value = f"{row.value:.3f}" if math.isfinite(row.value) else "undefined"
-            interval = "" if row.interval is None else f"{row.interval[0]:.2f} to {row.interval[1]:.2f}"
-            rows.append((row.name, value, interval, row.rule + limit, MARKS[row.outcome].format(row.remedy)))
-        title = f"acceptance {words}: {self.task}, {self.episodes} held-out real episodes"
-        columns, caption = ("criterion", "value", "95 %", "must be", ""), "\n".join(self.notes) or None
-        return make_table(title, columns, rows, left=("criterion", "must be", ""), caption=caption)
 
 
 def model_metrics(models: WorldModels, heldout: EpisodeArrays, config: RunConfig) -> dict[str, float]:
@@ -220,15 +123,15 @@ def _picture_criteria(
     metrics: Mapping[str, float | None], config: RunConfig, num_steps: int
 ) -> tuple[list[Criterion], list[str]]:
     """Criteria and notes of what is known by pictures alone, see pictures.picture_metrics."""
-    step, auc = judged_horizon(metrics), _number(metrics.get(f"done_{config.task}_auc"))
+    step, auc = judged_horizon(metrics), number_of(metrics.get(f"done_{config.task}_auc"))
     notes = [f"AUC of the done signal: {auc:.2f}, chance is 0.5." if math.isfinite(auc)
              else "AUC of the done signal was not judged: all held-out episodes succeed, or none."]
     if not step:
         return [], [*notes, "Pictures of rollouts were not judged: nothing was measured."]
-    ratio, *ends = (_at(metrics, f"feature_ratio{end}", step) for end in ("", "_low", "_high"))
+    ratio, *ends = (at_step(metrics, f"feature_ratio{end}", step) for end in ("", "_low", "_high"))
     name, limit = f"feature distance / copying, step {step}", config.acceptance.feature_error_ratio
     criteria = [_below(name, ratio, limit, _interval(*ends), MORE_RECORDED)]
-    ratio, low, high = (_at(metrics, f"other_actions{end}", step) for end in ("", "_low", "_high"))
+    ratio, low, high = (at_step(metrics, f"other_actions{end}", step) for end in ("", "_low", "_high"))
     if math.isfinite(low):
         limit = config.acceptance.other_actions_ratio
         outcome, rule = _of_interval(ratio, low, high, limit, limit - 1)
@@ -251,8 +154,8 @@ def _position_criteria(
     notes = [
         f"Errors are those of the full horizon over those of copying the first frame; the object's over the episodes "
         f"in which it moved more than {100 * MOVED_M:g} cm; the probe alone errs by "
-        f"{_at(metrics, 'object_floor_cm', num_steps):.2f} cm (object) and "
-        f"{_at(metrics, 'tool_floor_cm', num_steps):.2f} cm (tool) on real frames."
+        f"{at_step(metrics, 'object_floor_cm', num_steps):.2f} cm (object) and "
+        f"{at_step(metrics, 'tool_floor_cm', num_steps):.2f} cm (tool) on real frames."
     ]
     if "object" not in judged_things(task):
         notes.append(f"The object hardly moves in {task}, so its error is not judged; the tool's is.")
@@ -260,7 +163,7 @@ def _position_criteria(
         ("object", "object_moved_ratio", limits.object_error_ratio), ("tool", "tool_ratio", limits.tool_error_ratio),
     ):
         if name in judged_things(task):
-            ratio, *ends = (_at(metrics, f"{key}{end}", num_steps) for end in ("", "_low", "_high"))
+            ratio, *ends = (at_step(metrics, f"{key}{end}", num_steps) for end in ("", "_low", "_high"))
             criteria.append(_below(f"{name} error / copying, step {num_steps}", ratio, limit, _interval(*ends)))
     return criteria, notes
 
@@ -387,7 +290,7 @@ def _mean_of_parts(
     metrics: Mapping[str, float | None], parts: tuple[str, ...], kind: str
 ) -> tuple[float, tuple[float, float] | None]:
     """Mean over the parts whose value is known, and its interval, from those of the parts (MOVER)."""
-    rows = [[_number(metrics.get(f"done_{part}_{kind}{end}")) for end in ("", "_low", "_high")] for part in parts]
+    rows = [[number_of(metrics.get(f"done_{part}_{kind}{end}")) for end in ("", "_low", "_high")] for part in parts]
     known = [row for row in rows if math.isfinite(row[0])]
     if not known:
         return math.nan, None
@@ -407,15 +310,6 @@ def _interval(low: float, high: float) -> tuple[float, float] | None:
     return (low, high) if math.isfinite(low) and math.isfinite(high) else None
 
 
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)
-
-
-def _at(metrics: Mapping[str, float | None], name: str, step: int) -> float:
-    """The metric at a step; NaN where no episode was that long."""
-    return _number(metrics.get(f"{name}_h{step:02d}"))
-
-
 def _check(models: WorldModels, heldout: EpisodeArrays, task: str) -> None:
     for part in parts_of(task):
         models.task_index(part)
@@ -430,7 +324,3 @@ def _check(models: WorldModels, heldout: EpisodeArrays, task: str) -> None:
             f"{unknown} of {len(heldout)} held-out episodes carry no ground truth, so positions cannot "
             "be compared; measure on simulator episodes (environments/record.py), not on imagined or real-robot ones"
         )
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None

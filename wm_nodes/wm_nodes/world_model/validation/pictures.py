@@ -18,6 +18,7 @@ from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.reports.console_table import decimal, make_table
 from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.tokenizer import Tokenizer
+from wm_nodes.world_model.validation.acceptance_report import at_step
 from wm_nodes.world_model.validation.controllability import follow
 from wm_nodes.world_model.validation.open_loop import BATCH, HORIZONS, imagine_episodes
 
@@ -76,7 +77,7 @@ def judged_horizon(metrics: Mapping[str, float | None]) -> int:
 def horizon_table(metrics: Mapping[str, float | None]) -> Table:
     """picture_metrics for the terminal, a row for each step."""
     def shown(name: str, step: int) -> str:
-        value, low, high = (_number(metrics.get(f"{name}{end}_h{step:02d}")) for end in ("", "_low", "_high"))
+        value, low, high = (at_step(metrics, f"{name}{end}", step) for end in ("", "_low", "_high"))
         return decimal(value) + (f" ({low:.2f} to {high:.2f})" if np.isfinite(low) else "")
 
     columns = ("step", "episodes", "rollout / first frame", "reconstruction / first frame", "other / recorded actions")
@@ -103,7 +104,3 @@ def _reconstructed(tokenizer: Tokenizer, images: UInt8Array) -> UInt8Array:
 
 def _ratio(top: FloatArray, bottom: FloatArray) -> float:
     return float(top.mean() / bottom.mean()) if len(bottom) and bottom.mean() > 0 else float("nan")
-
-
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else float(value)

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from run_holders import HOLD, holder, start_holder
 
-from wm_nodes.core.run_lock import NAME, Holder, RunFolderInUseError, RunLock
+from wm_nodes.training.run_lock import NAME, Holder, RunFolderInUseError, RunLock
 
 RACERS, RACES = 4, 5
 
@@ -129,7 +129,7 @@ def test_ctrl_c_lets_go_of_the_folder(tmp_path: Path) -> None:
 
 def test_the_end_of_a_process_lets_go_of_its_folder(tmp_path: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from wm_nodes.core.run_lock import RunLock\n"
+        "import sys; from pathlib import Path; from wm_nodes.training.run_lock import RunLock\n"
         "RunLock(Path(sys.argv[1])).acquire(); raise KeyboardInterrupt"
     )
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, check=False)
@@ -173,7 +173,7 @@ def test_a_lock_file_that_a_person_deleted_is_no_trouble(tmp_path: Path) -> None
 def test_new_folders_of_one_name_are_as_many_as_processes_begin_them_at_once(tmp_path: Path) -> None:
     wanted, names = tmp_path / "runs" / "20260101-000000-push", ["", "-2", "-3", "-4"]
     code = f"""
-import sys; from pathlib import Path; from wm_nodes.core.run_lock import RunLock
+import sys; from pathlib import Path; from wm_nodes.training.run_lock import RunLock
 with RunLock(Path({str(wanted)!r}), new=True) as lock:
     print(lock.folder, flush=True)
     (lock.folder / "config.yaml").touch()
