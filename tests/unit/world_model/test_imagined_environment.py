@@ -29,6 +29,7 @@ from wm_nodes.world_model import (
     load_starts,
     save_model_folder,
 )
+from wm_nodes.world_model.imagined_episodes import put_where
 from wm_nodes.world_model.parts import PART
 
 NUM_ENVS, NUM_STARTS = 3, 5
@@ -283,3 +284,17 @@ def test_too_little_memory_names_the_number_of_environments(
     monkeypatch.setattr(type(models.action), "advance", full)
     with pytest.raises(DeviceError, match=r"^the memory of cpu is too small; lower ppo\.num_envs from 3 to 1, or take"):
         env.step(actions(0))
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [((3, 5, 7, 3), torch.uint8), ((3, 8, 4, 3), torch.uint8), ((3, 3), torch.float32), ((3, 0), torch.float32),
+     ((3, 4, 5), torch.bfloat16)],
+)
+def test_rows_are_put_in_place_where_the_mask_says_and_to_the_bit(shape: tuple[int, ...], kind: torch.dtype) -> None:
+    mask, (before, new) = torch.tensor([True, False, True]), (50 * torch.randn(2, *shape)).to(kind)
+    now = before.clone()
+    memory = now.data_ptr()
+    put_where(mask, now, new.transpose(1, -1).contiguous().transpose(1, -1))
+    wanted = [new[0].tolist(), before[1].tolist(), new[2].tolist()]
+    assert now.tolist() == wanted and now.data_ptr() == memory

@@ -205,8 +205,14 @@ class ImaginedEpisodes:
 
 
 def put_where(mask_N: Tensor, now: Tensor, new: Tensor) -> None:
-    """Put the rows of `new` where the mask is True into `now`, in place; both (N, ...)."""
-    torch.where(mask_N.view(-1, *[1] * (now.ndim - 1)), new, now, out=now)
+    """Put the rows of `new` where the mask is True into `now`, in place; both (N, ...), of one type. Rows are moved as
+    the widest integers that fit: frames byte by byte took several percent of a step."""
+    if not now.numel():  # no state values
+        return
+    row_bytes = now[0].numel() * now.element_size()
+    wide = next(kind for kind in (torch.int64, torch.int32, torch.int16, torch.uint8) if not row_bytes % kind.itemsize)
+    now, new = (rows.flatten(1).view(wide) for rows in (now, new.to(now.dtype)))
+    torch.where(mask_N.unsqueeze(1), new, now, out=now)
 
 
 def imagined_spec(spec: EnvironmentSpec, env_id: str, sha256: str, num_envs: int) -> EnvironmentSpec:
