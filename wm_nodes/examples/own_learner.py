@@ -1,4 +1,4 @@
-"""A learner of your own, regression on the actions that were paid best; see Learner in policy_rl/training_run.py.
+"""A learner of your own, regression on the actions that were paid best; see Learner in policy_rl/learner.py.
 
 python -m wm_nodes.policy_rl.train --learner.factory examples.own_learner:BestActionsLearner
     --preset smoke --updates 3 --ppo.num_steps 16

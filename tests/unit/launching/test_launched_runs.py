@@ -55,6 +55,18 @@ def test_the_folder_alone_brings_back_settings_and_arguments(
     assert prepare_graph("online_training", run_in(tmp_path), launch_arguments.sys.executable) == again
 
 
+def test_a_run_that_was_moved_goes_on_with_its_own_files(tmp_path: Path, model: str) -> None:
+    run, moved = tmp_path / "run", tmp_path / "moved"
+    inside = {"initial_policy": "policies/weak.safetensors", "starts_file": "starts.safetensors"}
+    begun = {"preset": "smoke", "model_dir": model, **{name: str(run / file) for name, file in inside.items()}}
+    _, values = launch_arguments.begin("online_training", {**run_in(tmp_path), **begun})
+    run.rename(moved)
+    _, again = launch_arguments.begin("online_training", {"run_dir": str(moved)})
+    assert {name: again[name] for name in inside} == {name: str(moved / file) for name, file in inside.items()}
+    assert again["bag_uri"] == str(moved / Path(values["bag_uri"]).relative_to(run)) and again["model_dir"] == model
+    assert str(run) + "/" not in (moved / "config.yaml").read_text(encoding="utf-8")
+
+
 def test_given_arguments_that_differ_are_named_and_nothing_is_touched(tmp_path: Path, model: str) -> None:
     begun = {"preset": "smoke", "model_dir": model, "num_envs": "6", "reward": "agent", "judge": "http://a/v1",
              "judge_model": "judge"}

@@ -12,11 +12,13 @@ from recording_samples import make_spec
 
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import dump_config, load_config
-from wm_nodes.policy_rl.rescoring import rescore_bag
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.policy_rl.rescoring import model_of_run, rescore_bag
 from wm_nodes.recording import BagError, topics
 from wm_nodes.recording import messages as m
 from wm_nodes.recording.layout import Tiles
 from wm_nodes.reward import EndogenousReward, RewardInput, RewardModel, RuleReward, pixel_l1
+from wm_nodes.training.run_record import RunRecord
 
 
 @dataclass
@@ -105,3 +107,13 @@ def test_the_command_builds_the_runs_reward_model_and_says_whether_the_bits_are_
     assert "build it with the weights and thresholds of the run's configuration" in capsys.readouterr().err
     assert main(["rescore", str(tmp_path / "nothing")]) == 2
     assert capsys.readouterr().err.startswith("error: ")
+
+
+def test_the_model_of_a_run_is_the_one_that_it_made_else_the_one_that_it_was_begun_with(tmp_path: Path) -> None:
+    options = {"train-policy": {"model_dir": str(tmp_path / "mine")}}
+    RunRecord(load_config("smoke", {"task": ""}).model_dump(), "smoke", options).write(tmp_path)
+    assert model_of_run(tmp_path, "") == tmp_path / "mine"
+    (tmp_path / "model").mkdir()
+    assert model_of_run(tmp_path, "") == tmp_path / "model"
+    (tmp_path / "other").mkdir()
+    assert model_of_run(tmp_path / "other", "reach") == shipped_model("reach")

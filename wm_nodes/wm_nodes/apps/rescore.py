@@ -35,7 +35,7 @@ from wm_nodes.judge.backends.factory import for_task
 from wm_nodes.judge.episode_reward import episode_judge
 from wm_nodes.judge.rejudge import judge_bag
 from wm_nodes.judge.service import READS, JudgeService, agent_scores, buffer_jobs, clip_fps
-from wm_nodes.policy_rl.rescoring import recorded_model, rescore_bag
+from wm_nodes.policy_rl.rescoring import model_of_run, recorded_model, rescore_bag
 from wm_nodes.recording.bag import is_bag
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reports.console_table import make_table
@@ -125,11 +125,11 @@ def _episodes(arguments: argparse.Namespace, bag: Path) -> Outcome:
     saved = run_dir / CONFIG
     file = arguments.config or (str(saved) if saved.is_file() else "cpu")
     config = load_config(file, judge_settings(arguments) | device_settings(arguments))
-    own, kept = run_dir / "model", Path(file).parent / READS
+    kept = Path(file).parent / READS
     judge = JudgeService(
         episode_judge(config), seed=config.seed, reads=arguments.reads or (kept if kept.is_dir() else None),
         audit=arguments.audit, device=config.device,
-        model_dir=arguments.model_dir or (own if own.is_dir() else shipped_model(config.task)),
+        model_dir=arguments.model_dir or model_of_run(run_dir, config.task),
     )
     with closing(judge):
         judged = judge_bag(bag, judge, namespace=arguments.namespace)

@@ -218,7 +218,7 @@ class PolicyConfig(SettingsSection):
 
 class LearnerConfig(SettingsSection):
     factory: FactoryName = ""
-    """module:callable(policy, config) -> Learner (policy_rl/training_run.py) instead of PPO; empty: none."""
+    """module:callable(policy, config) -> Learner (policy_rl/learner.py) instead of PPO; empty: none."""
 
 
 class SftConfig(SettingsSection):

@@ -27,9 +27,9 @@ EnvironmentName = Annotated[
 
 
 class SettingsSection(BaseModel):
-    """Frozen, and every unknown key is an error; the string under a field is its `description`."""
+    """Frozen, and every unknown key is an error; the string under a field explains it (apps/help)."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     def with_values(self, **values: Any) -> Self:
         """A copy with other values, checked as those of a preset are."""

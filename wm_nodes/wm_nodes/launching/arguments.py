@@ -26,6 +26,7 @@ from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.launching.graph import Graph, GraphError, compose
 from wm_nodes.launching.scenarios import (
     IMAGINED,
+    JUDGE,
     REAL,
     argument_table,
     build_graph,
@@ -43,7 +44,6 @@ OF_ONE_START = (
 """Arguments that a run does not keep."""
 FREE = ("namespace", "params_file", "record", "bag_uri", "rate", "train", "keep_buffers", "tensorboard")
 """Arguments that are kept and may be given anew."""
-JUDGE = ("judge", "judge_model", "judge_key_env", "rubric")
 SETTINGS = ("task", "seed", "device", *JUDGE)
 """Arguments that stand for settings; in loop 2 `reward` does, too."""
 ARGUMENT_OF = {

@@ -142,7 +142,7 @@ def run_folder(scenario: str, given: Mapping[str, str], now: datetime | None = N
 
 
 def build_graph(scenario: str, arguments: Mapping[str, str]) -> Graph:
-    """Return the graph for resolved arguments (arguments.resolve fills run_dir, config_file and others)."""
+    """Return the graph for resolved arguments, see arguments.begin."""
     graph = scenario_of(scenario).build(arguments)
     environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": arguments["discovery_range"]}
     if arguments["domain_id"]:
@@ -316,14 +316,14 @@ class Scenario:
     """Whose settings it has: policy or video, as config/load.py says."""
 
 
-_JUDGE = ("judge", "judge_model", "judge_key_env", "rubric")
+JUDGE = ("judge", "judge_model", "judge_key_env", "rubric")
 _TRAINING = (
     *_COMMON, "model_dir", "starts_file", "first_frames_file", "initial_policy", "backend", "video_model_dir",
-    "reward", "num_envs", "simulator_envs", "simulator", "learner_ranks", "record", "bag_uri", *_JUDGE,
+    "reward", "num_envs", "simulator_envs", "simulator", "learner_ranks", "record", "bag_uri", *JUDGE,
 )
 _ROLLOUT = (
     "model_dir", "starts_file", "initial_policy", "backend", "video_model_dir", "mode", "reward", "num_envs",
-    "record", "bag_uri", *_JUDGE,
+    "record", "bag_uri", *JUDGE,
 )
 _EVALUATE = (*_COMMON, "model_dir", "initial_policy", "simulator_envs", "record", "bag_uri")
 
@@ -338,10 +338,10 @@ SCENARIOS: dict[str, Scenario] = {
         Scenario("evaluate", "Measure a policy in the simulator", _EVALUATE, _evaluate),
         Scenario("world_model_rl", "Post-train the video model by GRPO on clips that it samples",
                  (*(name for name in _COMMON if name != "compose"), "model_dir", "video_model_dir", "context_bags",
-                  "heldout_bags", "keep_buffers", "tensorboard", "record", "bag_uri", "reward", *_JUDGE),
+                  "heldout_bags", "keep_buffers", "tensorboard", "record", "bag_uri", "reward", *JUDGE),
                  _world_model_rl, "video"),
         Scenario("judge_clips", "Have the reward agent judge folders of clips (action reward/judge_clips)",
-                 (*(name for name in _COMMON if name != "compose"), "model_dir", *_JUDGE), _judge_clips),
+                 (*(name for name in _COMMON if name != "compose"), "model_dir", *JUDGE), _judge_clips),
     )
 }
 

@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from wm_nodes.config.load import load_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.lockstep import Rewards
-from wm_nodes.policy_rl.factories import make_endogenous_reward
+from wm_nodes.policy_rl.factories import make_endogenous_reward, make_reward
 from wm_nodes.policy_rl.rollouts import reward_input
 from wm_nodes.recording import Bag, BagError
 from wm_nodes.recording.join import LockSteps
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reward import RewardModel, RewardResult, RuleReward
+from wm_nodes.training.run_record import read_record
 
 
 @dataclass
@@ -88,12 +89,23 @@ def recorded_model(
     name = recorded_reward_name(bag)
     run_dir = bag.absolute().parent.parent
     config = load_config(config_file or str(run_dir / "config.yaml"), {"device": device} if device else {})
+    if config.reward.factory:
+        return make_reward(config, None)
     if name == "rule":
         return RuleReward(config.reward.sparse_weight)
     if name != "endogenous":
         raise BagError(f"{bag} holds rewards of {name or 'nobody'}; endogenous, rule and agent can be scored again")
-    own = run_dir / "model"
-    return make_endogenous_reward(config, model_dir or (own if own.is_dir() else shipped_model(config.task)))
+    return make_endogenous_reward(config, model_dir or model_of_run(run_dir, config.task))
+
+
+def model_of_run(run_dir: Path, task: str) -> Path:
+    """The world model of a run: that which it made, else the one that it was begun with, else the shipped one of its
+    task."""
+    if (own := run_dir / "model").is_dir():
+        return own
+    record = read_record(run_dir)
+    begun_with = [options.get("model_dir") for options in record.options.values()] if record else []
+    return Path(begun_with[0]) if begun_with and begun_with[0] else shipped_model(task)
 
 
 def _differences(recorded: Rewards, result: RewardResult) -> list[str]:

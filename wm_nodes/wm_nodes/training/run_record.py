@@ -13,7 +13,7 @@ Options and settings that are given again must be those of the record; what may 
 """
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic
@@ -25,6 +25,8 @@ from wm_nodes.config.sections import SettingsSection
 from wm_nodes.core.files import write_atomic
 
 CONFIG, DEVICE, PRESET = "config.yaml", "device", "preset"
+HERE = "<run folder>/"
+"""Stands in kept options for the folder that the record lies in, so that a run can be moved."""
 MOST_NAMED = 5
 
 
@@ -78,7 +80,7 @@ class RunRecord:
         """Write config.yaml where it is another one. Raises OSError."""
         run = {
             PRESET: self.preset, "settings_sha256": _sha256(self.settings),
-            "options": {name: dict(options) for name, options in self.options.items()},
+            "options": _renamed(self.options, f"{folder.absolute()}/", HERE),
         }
         data = str(yaml.safe_dump({**self.settings, RECORD: run}, sort_keys=False)).encode()
         path = folder / CONFIG
@@ -107,7 +109,7 @@ def read_record(folder: Path) -> RunRecord | None:
             f"{path} is not what the run was begun with (settings_sha256 differs); restore it, or begin another run "
             "folder with this file as its preset"
         )
-    return RunRecord(settings, run[PRESET], run["options"])
+    return RunRecord(settings, run[PRESET], _renamed(run["options"], HERE, f"{folder.absolute()}/"))
 
 
 def take_up(
@@ -173,6 +175,15 @@ def _refuse(folder: Path, differences: Mapping[str, tuple[Any, Any]]) -> None:
             f"{folder} was begun with other options: {'; '.join(named[:MOST_NAMED])}{more}. Leave them out to go on "
             "with it, or begin another run folder"
         )
+
+
+def _renamed(value: Any, old: str, new: str) -> Any:
+    """Options with another beginning of the paths in them."""
+    if isinstance(value, Mapping):
+        return {name: _renamed(part, old, new) for name, part in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_renamed(part, old, new) for part in value]
+    return value.replace(old, new) if isinstance(value, str) else value
 
 
 def _lies_in(name: str, section: str) -> bool:

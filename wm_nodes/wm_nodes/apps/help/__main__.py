@@ -1,10 +1,14 @@
 """`python -m wm_nodes.apps.help`: write the pages anew, from the parsers of the verbs and what config/ explains."""
 
 import argparse
+import ast
+import inspect
 import json
 import os
 import textwrap
 from collections.abc import Iterator
+from itertools import pairwise
+from typing import cast
 
 from wm_nodes.apps.cli import VERBS, parser_of
 from wm_nodes.apps.help import FOLDER, PROGRAM, page_file
@@ -34,8 +38,18 @@ def settings_page(title: str, settings: SettingsSection, path: str = "") -> str:
     return "\n".join([f"{title}:", *_settings_lines(settings, path), ""])
 
 
+def explanations(section: type[SettingsSection]) -> dict[str, str]:
+    """The string under each field of a section, by the field's name."""
+    body = cast("ast.ClassDef", ast.parse(inspect.getsource(section)).body[0]).body
+    return {
+        ast.unparse(field.target): ast.literal_eval(text.value) for field, text in pairwise(body)
+        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr)
+    }
+
+
 def _settings_lines(settings: SettingsSection, path: str) -> Iterator[str]:
-    for name, about in type(settings).model_fields.items():
+    about = explanations(type(settings))
+    for name in type(settings).model_fields:
         value = getattr(settings, name)
         if isinstance(value, SettingsSection):
             yield from ["", *textwrap.wrap(f"{path}{name}: {_one_line(type(value).__doc__)}", int(COLUMNS) - 2)]
@@ -43,7 +57,7 @@ def _settings_lines(settings: SettingsSection, path: str) -> Iterator[str]:
         else:
             yield f"  --{path}{name} {json.dumps(value)}"
             yield from textwrap.wrap(
-                _one_line(about.description), int(COLUMNS) - 2, initial_indent=" " * 8, subsequent_indent=" " * 8
+                _one_line(about.get(name)), int(COLUMNS) - 2, initial_indent=" " * 8, subsequent_indent=" " * 8
             )
 
 
