@@ -3,10 +3,7 @@ the string under it, and `run()`. `wm benchmark NAME` imports the one that it st
 """
 
 import argparse
-import ast
-import inspect
 import json
-import textwrap
 import time
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
@@ -18,6 +15,7 @@ from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin, g
 import torch
 from rich.console import Console
 
+from wm_nodes.apps.help.explanations import explanations
 from wm_nodes.apps.options import positive, prepare_torch
 from wm_nodes.core.device import CPU, compute_device
 from wm_nodes.core.files import write_atomic
@@ -118,7 +116,7 @@ class Experiment:
 
 @dataclass(kw_only=True)
 class OnDevice(Experiment):
-    """An experiment of loop 2."""
+    """An experiment that computes on one device."""
 
     device: str = CPU
     """Where models compute: cpu, cuda, cuda:N or auto."""
@@ -133,20 +131,6 @@ def find_experiment(name: str) -> type[Experiment]:
     module, _, kind = EXPERIMENTS[name].partition(":")
     found: type[Experiment] = getattr(import_module(f"benchmarks.{module}"), kind)
     return found
-
-
-def explanations(record: type) -> dict[str, str]:
-    """The string under each field of a class and of those that it is derived from."""
-    texts = dict[str, str]()
-    for kind in reversed(record.__mro__[:-1]):
-        if "__annotations__" not in vars(kind) or kind.__module__ == "typing":
-            continue
-        body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
-        assert isinstance(body, ast.ClassDef)
-        for line, below in zip(body.body, body.body[1:]):
-            if isinstance(line, ast.AnnAssign) and isinstance(below, ast.Expr):
-                texts[ast.unparse(line.target)] = " ".join(str(ast.literal_eval(below.value)).split())
-    return texts
 
 
 def _argument(kind: Any, default: Any) -> dict[str, Any]:

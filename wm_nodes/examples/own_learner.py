@@ -3,15 +3,15 @@
 python -m wm_nodes.policy_rl.train --learner.factory examples.own_learner:BestActionsLearner
     --preset smoke --updates 3 --ppo.num_steps 16
 """
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.image_policy import ImagePolicy
-from wm_nodes.policy_rl.rollouts import Canceled
+from wm_nodes.policy_rl.rollouts import Canceled, TensorRollout, tensors_of
 from wm_nodes.training import checkpoint
 
 
@@ -20,15 +20,15 @@ class BestActionsLearner:
         self._policy = policy
         self._optimizer = torch.optim.Adam(policy.actor.parameters(), config.ppo.learning_rate)
 
-    def update(self, rollout: Rollout, *, should_stop: Callable[[], bool] | None = None) -> dict[str, float]:
+    def update(self, rollout: Rollout | TensorRollout, *, should_stop: Any = None) -> dict[str, float]:
         if should_stop and should_stop():
             raise Canceled
-        returns_TN = rollout.rewards_TN[::-1].cumsum(0)[::-1]
-        best = rollout.valid_TN & (returns_TN >= returns_TN[rollout.valid_TN].mean())
-        states, actions = (torch.from_numpy(array[best]) for array in (rollout.states_TN, rollout.actions_TN))
-        means = self._policy.distribution(self._policy.features(rollout.images_TN[best]), states).mean_BA
+        data = tensors_of(rollout, self._policy)
+        returns_TN = data.rewards_TN.flip(0).cumsum(0).flip(0)
+        best = data.valid_TN & (returns_TN >= returns_TN[data.valid_TN].mean())
+        means = self._policy.distribution(data.features_TN[best], data.states_TN[best]).mean_BA
         self._optimizer.zero_grad()
-        torch.autograd.backward((means - actions).square().mean())
+        torch.autograd.backward((means - data.actions_TN[best]).square().mean())
         self._optimizer.step()
         return {"samples": float(best.sum())}
 

@@ -7,7 +7,7 @@ import asyncio
 import math
 import threading
 import time
-from collections.abc import Callable, Coroutine, Iterable, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -155,7 +155,7 @@ class JudgeService:
     @property
     def cards(self) -> list[str]:
         """The measured abilities of each judge, as text; judges without a measurement are left out."""
-        return [card for slot in self._slots.values() if (card := slot.agent.judge.capabilities.card)]
+        return [card for slot in _distinct(self._slots) if (card := slot.agent.judge.capabilities.card)]
 
     def set_rubric(self, pack: str, files: NamedFiles) -> None:
         """Judge by another rubric from now on; call it while nothing is being judged.
@@ -171,7 +171,7 @@ class JudgeService:
         rubric = load_rubric(pack, read=lambda name: files.read(name, RUBRIC))
         old, self._slots = self._slots, self._make_slots(rubric)
         self.pack = pack
-        for slot in old.values():
+        for slot in _distinct(old):
             self._run(slot.opened.close())
 
     def submit(self, job: ClipJob, deadline: float | None = None) -> "Future[Verdict]":
@@ -287,8 +287,13 @@ class JudgeService:
         for task in others:
             task.cancel()
         await asyncio.gather(*others, return_exceptions=True)
-        for slot in {id(slot): slot for slot in self._slots.values()}.values():
+        for slot in _distinct(self._slots):
             await slot.opened.close()
+
+
+def _distinct(slots: Mapping[str, _JudgeSlot]) -> list[_JudgeSlot]:
+    """Each judge once, though several tasks have it."""
+    return list({id(slot): slot for slot in slots.values()}.values())
 
 
 def _settings_by_task(

@@ -123,8 +123,7 @@ def untrained_policy(config: RunConfig) -> ImagePolicy:
         return adaptive_avg_pool2d(images.movedim(-1, 1).float() / 255, GRID).flatten(1)
 
     encoder = ImageEncoder(encode, 3 * GRID * GRID)
-    unscaled = [0.0] * spec.state_dim, [1.0] * spec.state_dim
-    return ImagePolicy(encoder, spec.state_dim, spec.action_dim, config.policy, seed=config.seed, state_range=unscaled)
+    return ImagePolicy(encoder, spec.state_dim, spec.action_dim, config.policy, seed=config.seed)
 
 
 def make_reward(config: RunConfig, model_dir: Path | None) -> RewardModel:

@@ -13,7 +13,7 @@ from safetensors.torch import save
 
 from wm_nodes.config import seed_ranges
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.config.tasks import get_task, has_rule, success
+from wm_nodes.config.tasks import get_task, has_rule, has_simulator, success
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Episode
@@ -167,7 +167,7 @@ def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Pa
         plan = demonstration_plan(config, config.sft.num_demonstrations + spare)
         demos = collect_plan(plan, config, run_dir / "bags" / "demos")
     starts, weak = start_files(run_dir)
-    if not starts.exists() and not config.task:
+    if not starts.exists() and not has_simulator(config.task):
         write_atomic(starts, (model_dir / STARTS).read_bytes())
     elif not starts.exists():
         bags = collect_plan(starts_plan(config), config, run_dir / "bags" / "starts")

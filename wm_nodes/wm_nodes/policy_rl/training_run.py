@@ -34,8 +34,6 @@ from wm_nodes.training.weights import PackedWeights, load_weights, pack_weights
 POLICY_FILES = VersionFiles("policies/policy")
 
 
-
-
 @dataclass
 class Progress:
     """Counts over the whole run folder."""

@@ -1,8 +1,8 @@
 """What every imagined environment shares: real starts, exact tool positions, step limits, ends by a done signal.
 
-The rules are one tensor program, DeviceEpisodes, whose step waits for nothing and copies nothing up or down:
-everything stays where the models are, in memory of fixed shape that changes in place, so that a GPU can run a step as
-one captured graph. ImaginedEpisodes is its NumPy face, behind the Environment interface.
+The rules are one tensor program, DeviceEpisodes: everything stays where the models are, in memory of fixed shape that
+changes in place. The step of the world model's (DeviceEnvironment) waits for nothing and copies nothing up or down, so
+that a GPU can run it as one captured graph. ImaginedEpisodes is its NumPy face, behind the Environment interface.
 
 Shapes: N environments, M starts, H W 3 image, A action, P state.
 """
@@ -66,7 +66,7 @@ class DeviceEpisodes(ABC):
     def __init__(
         self, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray], reward: RewardConfig, device: torch.device
     ) -> None:
-        self.spec, self.starts, self.reward, self.device = spec, starts, reward, device
+        self.spec, self.reward, self.device = spec, reward, device
         images, states = starts
         self.num_starts = len(images)
         self._start_frames = torch.from_numpy(images).to(device)

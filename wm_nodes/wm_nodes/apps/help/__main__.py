@@ -1,17 +1,14 @@
 """`python -m wm_nodes.apps.help`: write the pages anew, from the parsers of the verbs and what config/ explains."""
 
 import argparse
-import ast
-import inspect
 import json
 import os
 import textwrap
 from collections.abc import Iterator
-from itertools import pairwise
-from typing import cast
 
 from wm_nodes.apps.cli import VERBS, parser_of
 from wm_nodes.apps.help import FOLDER, PROGRAM, page_file
+from wm_nodes.apps.help.explanations import explanations
 from wm_nodes.apps.options import JUDGE
 from wm_nodes.config.load import POLICY, VIDEO, load_config, load_video_config
 from wm_nodes.config.sections import SettingsSection
@@ -38,15 +35,6 @@ def settings_page(title: str, settings: SettingsSection, path: str = "") -> str:
     return "\n".join([f"{title}:", *_settings_lines(settings, path), ""])
 
 
-def explanations(section: type[SettingsSection]) -> dict[str, str]:
-    """The string under each field of a section, by the field's name."""
-    body = cast("ast.ClassDef", ast.parse(inspect.getsource(section)).body[0]).body
-    return {
-        ast.unparse(field.target): ast.literal_eval(text.value) for field, text in pairwise(body)
-        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr)
-    }
-
-
 def _settings_lines(settings: SettingsSection, path: str) -> Iterator[str]:
     about = explanations(type(settings))
     for name in type(settings).model_fields:
@@ -57,7 +45,7 @@ def _settings_lines(settings: SettingsSection, path: str) -> Iterator[str]:
         else:
             yield f"  --{path}{name} {json.dumps(value)}"
             yield from textwrap.wrap(
-                _one_line(about.get(name)), int(COLUMNS) - 2, initial_indent=" " * 8, subsequent_indent=" " * 8
+                about.get(name, ""), int(COLUMNS) - 2, initial_indent=" " * 8, subsequent_indent=" " * 8
             )
 
 

@@ -23,7 +23,7 @@ from wm_nodes.world_model.positions import judged_things
 from wm_nodes.world_model.validation.acceptance_report import AcceptanceReport, Criterion, Outcome, at_step, number_of
 from wm_nodes.world_model.validation.goals import goal_metrics
 from wm_nodes.world_model.validation.open_loop import MOVED_M, evaluate_rollouts
-from wm_nodes.world_model.validation.pictures import judged_horizon, picture_metrics
+from wm_nodes.world_model.validation.pictures import horizons_of, judged_horizon, picture_metrics
 
 MORE_TRAINING = (
     "train longer (world_model.num_iterations) or on more episodes near contact (data.num_episodes, data.behaviours)"
@@ -189,7 +189,7 @@ def report_when_made(
         task, steps = spec["task"], spec["max_episode_steps"]
         config = config.model_copy(update={"task": task})
     metrics = held.get(task, held)
-    if f"tool_ratio_h{steps:02d}" not in metrics and (spec.get("ground_truth_names", True) or not metrics):
+    if f"tool_ratio_h{steps:02d}" not in metrics and not horizons_of(metrics):
         of_policy, left_out = _policy_criteria(config, imagined, real, None)
         note = f"the model's manifest holds no metrics of held-out episodes of {task}"
         return AcceptanceReport(task, 0, tuple(of_policy), {}, (note, *left_out))

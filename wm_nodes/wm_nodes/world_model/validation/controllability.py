@@ -39,10 +39,9 @@ def controllability_metrics(
     first = episode_targets(episodes)[:, 0][:, tool]
     frames, errors = dict[str, UInt8Array](), dict[str, FloatArray]()
     for name, taken in actions.items():
-        states = follow(episodes.states[:, 0], taken, spec)
-        told = replace(episodes, actions=taken, states=states)
-        frames[name] = imagine_episodes(models.tokenizer, models.action, told).frames
-        wanted = first[:, None] + states[:, 1:, :3] - states[:, :1, :3]
+        commanded = under_actions(episodes, taken, spec)
+        frames[name] = imagine_episodes(models.tokenizer, models.action, commanded).frames
+        wanted = first[:, None] + commanded.states[:, 1:, :3] - commanded.states[:, :1, :3]
         if tool:
             errors[name] = 100 * np.linalg.norm(read(frames[name])[..., tool] - wanted, axis=-1)
     metrics = dict[str, float]()
@@ -59,6 +58,11 @@ def controllability_metrics(
         for name, error in errors.items():
             metrics[f"tool_{name}_cm_h{horizon:02d}"] = float(error[rows, horizon - 1].mean())
     return metrics
+
+
+def under_actions(episodes: EpisodeArrays, actions_ETA: FloatArray, spec: EnvironmentSpec) -> EpisodeArrays:
+    """The episodes with other actions, and the states that these command."""
+    return replace(episodes, actions=actions_ETA, states=follow(episodes.states[:, 0], actions_ETA, spec))
 
 
 def follow(first_ES: FloatArray, actions_ETA: FloatArray, spec: EnvironmentSpec) -> FloatArray:

@@ -5,12 +5,13 @@ The distance of two frames is the mean absolute difference of the latents that t
 """
 
 import re
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import torch
 from rich.table import Table
+from torch import Tensor
 
 from wm_nodes.core.statistics import bootstrap_ratio
 from wm_nodes.core.types import FloatArray, UInt8Array
@@ -19,7 +20,7 @@ from wm_nodes.reports.console_table import decimal, make_table
 from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.validation.acceptance_report import at_step
-from wm_nodes.world_model.validation.controllability import follow
+from wm_nodes.world_model.validation.controllability import under_actions
 from wm_nodes.world_model.validation.open_loop import BATCH, HORIZONS, imagine_episodes
 
 SAME_ACTION = 1e-3
@@ -36,22 +37,24 @@ def picture_metrics(models: WorldModels, episodes: EpisodeArrays) -> dict[str, f
     actions differ: 1 where actions are ignored. `_low`, `_high`: 95 %, bootstrap over episodes.
     """
     tokenizer, others = models.tokenizer, np.roll(episodes.actions, 1, axis=0)
-    states = follow(episodes.states[:, 0], others, models.spec)
     rollouts = imagine_episodes(tokenizer, models.action, episodes).frames
-    misled = imagine_episodes(tokenizer, models.action, replace(episodes, actions=others, states=states)).frames
+    misled = imagine_episodes(tokenizer, models.action, under_actions(episodes, others, models.spec)).frames
     differ = np.abs(episodes.actions - others).mean(2)
     metrics = dict[str, float]()
     for horizon in sorted({min(h, episodes.num_steps) for h in HORIZONS}):
         rows = np.flatnonzero(episodes.lengths >= horizon)
         if not len(rows):
             continue
-        real = episodes.images[rows, horizon]
-        rolled, copied = (
-            _distances(tokenizer, frames, real) for frames in (rollouts[rows, horizon - 1], episodes.images[rows, 0])
+        real = _in_batches(tokenizer.encode, episodes.images[rows, horizon])
+        reconstructed = _in_batches(tokenizer.decode, real).cpu().numpy()
+        rolled, copied, floor = (
+            _distances(tokenizer, frames, real)
+            for frames in (rollouts[rows, horizon - 1], episodes.images[rows, 0], reconstructed)
         )
-        floor = _distances(tokenizer, _reconstructed(tokenizer, real), real)
         both = (np.roll(episodes.lengths, 1)[rows] >= horizon) & (differ[rows, :horizon].mean(1) > SAME_ACTION)
-        misled_by = _distances(tokenizer, misled[rows[both], horizon - 1], real[both]) if both.any() else rolled[:0]
+        misled_by = rolled[:0]
+        if both.any():
+            misled_by = _distances(tokenizer, misled[rows[both], horizon - 1], real[torch.from_numpy(both)])
         metrics[f"feature_episodes_h{horizon:02d}"] = float(len(rows))
         metrics[f"feature_floor_h{horizon:02d}"] = _ratio(floor, copied)
         for name, top, bottom in (("feature_ratio", rolled, copied), ("other_actions", misled_by, rolled[both])):
@@ -88,18 +91,14 @@ def horizon_table(metrics: Mapping[str, float | None]) -> Table:
     ), left=())
 
 
-def _distances(tokenizer: Tokenizer, frames: UInt8Array, real: UInt8Array) -> FloatArray:
-    """(E,) of frames and the recorded ones, uint8 (E, H, W, 3)."""
-    rows = [slice(i, i + BATCH) for i in range(0, len(real), BATCH)]
-    parts = [(tokenizer.encode(frames[row]) - tokenizer.encode(real[row])).abs().mean((1, 2)) for row in rows]
-    distances: FloatArray = torch.cat(parts).cpu().numpy()
+def _distances(tokenizer: Tokenizer, frames: UInt8Array, real_ESD: Tensor) -> FloatArray:
+    """(E,) of frames, uint8 (E, H, W, 3), to the latents of the recorded ones."""
+    distances: FloatArray = (_in_batches(tokenizer.encode, frames) - real_ESD).abs().mean((1, 2)).cpu().numpy()
     return distances
 
 
-def _reconstructed(tokenizer: Tokenizer, images: UInt8Array) -> UInt8Array:
-    rows = [slice(i, i + BATCH) for i in range(0, len(images), BATCH)]
-    frames: UInt8Array = torch.cat([tokenizer.decode(tokenizer.encode(images[row])) for row in rows]).cpu().numpy()
-    return frames
+def _in_batches(call: Callable[[Any], Tensor], rows: Any) -> Tensor:
+    return torch.cat([call(rows[i : i + BATCH]) for i in range(0, len(rows), BATCH)])
 
 
 def _ratio(top: FloatArray, bottom: FloatArray) -> float:
