@@ -23,6 +23,7 @@ from wm_nodes.world_model.validation.acceptance import (
     accept_world_model,
     accepted_when_made,
     apply_criteria,
+    report_when_made,
 )
 from wm_nodes.world_model.validation.acceptance_report import AcceptanceReport
 
@@ -252,6 +253,16 @@ def test_what_recordings_cannot_show_is_named_and_not_judged() -> None:
     for words in ("Precision of the done signal was not judged: every held-out episode succeeds",
                   "AUC of the done signal was not judged", "Sensitivity to actions was not judged"):
         assert words in notes
+
+
+def test_a_truth_without_positions_is_judged_by_what_the_pictures_said_when_the_model_was_made() -> None:
+    config = settings().model_copy(update={"task": ""})
+    manifest = {
+        "spec": {"task": "stir", "max_episode_steps": 16, "ground_truth_names": ["wetness"]},
+        "heldout": {**BY_PICTURES, "episodes": 20.0}, "success_threshold": config.reward.success_threshold,
+    }
+    report = report_when_made(manifest, config)
+    assert report.passed and report.episodes == 20 and len(report.criteria) == 4
 
 
 @pytest.fixture(scope="module")
