@@ -236,6 +236,14 @@ def success(task: str, ground_truth: Floats) -> NDArray[np.bool_]:
     return rule(ground_truth)
 
 
+def success_or_recorded(task: str, ground_truth: Floats, recorded: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether `task` is done in each (..., P) ground truth by its rule, or without a rule or ground truth as recorded.
+
+    recorded: (...,), the flags.
+    """
+    return success(task, ground_truth) if has_rule(task) and ground_truth.shape[-1] else recorded
+
+
 def instruction(task: str, scenes: str) -> str:
     """The instruction of a batch of episodes: of the scene where `scenes` (simulation.scenes) is one, else the task's.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.config.tasks import has_rule, model_tasks, success
+from wm_nodes.config.tasks import model_tasks, success_or_recorded
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import MODEL_FIELDS, EnvironmentSpec
 from wm_nodes.core.types import BoolArray, Episode
@@ -63,7 +63,7 @@ def read_training_data(bags: Sequence[Path], *, num_heldout: int, seed: int) -> 
     if all(np.ptp(np.concatenate([e.actions[:, i] for e in episodes])) == 0 for i in range(spec.action_dim)):
         raise BagError(f"every action in {named} is {episodes[0].actions[0].tolist()}, so nothing shows what actions "
                        "do; record while the robot is commanded")
-    won = np.array([_succeeds(episode, spec.task) for episode in episodes])
+    won = np.array([success_or_recorded(spec.task, e.ground_truth, e.success)[1:].any() for e in episodes], bool)
     if won.sum() < MIN_SUCCESSES:
         raise BagError(f"{won.sum()} of {len(won)} episodes in {named} succeed, and {MIN_SUCCESSES} are needed, to "
                        "learn when the task is done and to judge that; record successes, and set the success flag of "
@@ -117,13 +117,6 @@ def _read(bags: Sequence[Path], spec: EnvironmentSpec) -> tuple[list[Episode], l
             lost.append(f"lost from {bag}: {_count(report.lost_steps, 'message')} of wm/env/transition that the "
                         "recorder did not get")
     return episodes, lost or ["lost: nothing"]
-
-
-def _succeeds(episode: Episode, task: str) -> bool:
-    """By the task's rule where there is ground truth, else by the recorded flag."""
-    by_rule = has_rule(task) and episode.ground_truth.shape[1] > 0
-    done = success(task, episode.ground_truth) if by_rule else episode.success
-    return bool(done[1:].any())
 
 
 def _parts(episode: Episode, most: int) -> Iterator[Episode]:
