@@ -201,7 +201,7 @@ class Planner:
             if gap_s > self.tally.gaps.get(place, (0.0, ""))[0]:
                 begins_s = (times[largest] + int(stream.offset_ms * 1e6) - self.begun_ns) / NS_PER_S
                 self.tally.gaps[place] = gap_s, f"{self.name} at {begins_s:.1f} s"
-        return np.logical_and.reduce(fresh)
+        return np.asarray(np.logical_and.reduce(fresh))
 
     def _is_fresh(self, stream: Stream, ticks: Times) -> BoolArray:
         newest = stream.newest(ticks)
