@@ -4,10 +4,14 @@ The dot (the tool) moves by action * MAX_ACTION_M; a square it runs into moves o
 when the square's centre has moved DONE_AT_M along x.
 """
 
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
 import numpy as np
 
 from wm_nodes.core.types import BoolArray, Episode, FloatArray, UInt8Array
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
+from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 
 MAX_ACTION_M, DONE_AT_M, HALF_M = 0.08, 0.15, 0.07
 _INDEX = {name: i for i, name in enumerate(GROUND_TRUTH_NAMES)}
@@ -74,6 +78,12 @@ def episode(seed: int, *, num_steps: int = 12, size: int = 32) -> Episode:
         success=success("push_cube", truth), rewards=np.zeros(num_steps, np.float32), terminated=False, truncated=True,
         task="push_cube", instruction="push the square", behaviour="noisy", seed=seed, episode_id=seed, source=1,
     )
+
+
+def stacked_scene(episodes: Iterable[Episode], tasks: Sequence[str]) -> EpisodeArrays:
+    """The episodes stacked, with success by this scene's rule."""
+    arrays = stack_episodes(episodes, tasks)
+    return replace(arrays, success=np.stack([success(task, arrays.ground_truth) for task in tasks], -1))
 
 
 def pushed(before: FloatArray, after: FloatArray, cube: FloatArray) -> FloatArray:

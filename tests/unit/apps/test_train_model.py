@@ -1,6 +1,7 @@
 """wm train-model: a stranger's bag becomes a model that is judged, with what it says on the way."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 from unit.policy_rl.test_recorded_robots import NO_STATE, TINY, record
 
 from wm_nodes.apps.cli import main
+from wm_nodes.config.tasks import get_task
 from wm_nodes.world_model import load_model_folder
 
 SMALL = [word for name, value in TINY.items() if name != "task" for word in (f"--{name}", json.dumps(value))]
@@ -93,12 +95,32 @@ def test_each_mistake_is_one_line_that_says_what_to_do(
         assert not (tmp_path / "out" / "config.yaml").exists(), "another try may have other options"
 
 
-def test_a_task_file_names_the_task_of_the_recordings(
-    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_task_file_names_the_task_of_the_recordings_and_is_known_in_another_working_folder(
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("WM_TASKS", "")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    file = tmp_path / "touch_the_post.py"
+    folder, out = tmp_path / "tasks", tmp_path / "out"
+    folder.mkdir()
+    file = folder / "touch_the_post.py"
     file.write_text("from wm_nodes.config.tasks import Task\nTASK = Task('touch the post')\n", encoding="utf-8")
-    assert train("--bags", bag, "--task", file, "--out", tmp_path / "out") in (0, 3)
-    assert load_model_folder(tmp_path / "out" / "model").tasks == ("touch_the_post",)
+    monkeypatch.chdir(folder)
+    code = train("--bags", bag, "--task", file.name, "--out", out)
+    assert code in (0, 3), said(capsys)[1]
+    assert load_model_folder(out / "model").tasks == ("touch_the_post",)
+    assert get_task("touch_the_post").instruction == "touch the post"
+
+    shutil.rmtree(out / "model")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WM_TASKS", "")
+    assert main(["train-model", "--out", str(out)]) == code, said(capsys)[1]
+    assert os.environ["WM_TASKS"] == str(file)
+
+
+def test_a_finished_run_opens_no_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag, out = record(tmp_path / "bag", 16), tmp_path / "out"
+    code = train("--bags", bag, "--out", out)
+    shutil.rmtree(bag)
+    assert main(["train-model", "--out", str(out)]) == code, said(capsys)[1]
+    shutil.rmtree(out / "model")
+    assert main(["train-model", "--out", str(out)]) == 2
+    assert "no bag at" in said(capsys)[1]

@@ -107,7 +107,7 @@ def test_spans_of_seeds_by_hand() -> None:
 def test_stacked_episodes_know_their_seeds_however_they_are_put_together() -> None:
     spec = make_spec()
     stacked = stack_episodes([make_episode(spec, row, seed=seed) for row, seed in enumerate((7, 310_000, 8))], ("a",),
-                             lambda task, truth: truth[..., 0] > 0, num_steps=4)
+                             num_steps=4)
     assert stacked.seeds == (7, 310_000, 8) and stacked.select([2, 0]).seeds == (8, 7)
     both = EpisodeArrays.concatenate([stacked.select([1]), stacked])
     assert seed_spans(both.seeds) == [[7, 8], [310_000, 310_000]]

@@ -92,6 +92,13 @@ def test_a_robots_task_is_its_instruction_and_success_is_what_was_recorded(
     assert stack_episodes([recorded], ("fold",)).success[0, :, 0].tolist() == [False] * 12 + [True]
 
 
+def test_a_task_is_named_by_the_path_of_its_file_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    file = tmp_path / "unfold.py"
+    file.write_text(FOLD.replace("fold the", "unfold the"), encoding="utf-8")
+    monkeypatch.setenv(VARIABLE, f"{file}, ")
+    assert "unfold" in task_names() and get_task("unfold").instruction == "unfold the towel"
+
+
 def test_no_module_but_its_file_knows_a_task_by_its_name() -> None:
     root = Path(wm_nodes.__file__).parent
     named = {
@@ -139,6 +146,7 @@ def test_the_command_line_and_the_settings_name_the_known_tasks(
     ("package", "files", "error"),
     [
         ("absent_tasks", None, r"WM_TASKS names 'absent_tasks', no package"),
+        ("/absent/pour.py", None, r"WM_TASKS names '/absent/pour.py', which is no file"),
         ("empty_tasks", {"blank": "TASK = 1"}, r"blank\.py has no TASK = Task\(\.\.\.\)"),
         ("double_tasks", {"reach": ""}, r"'reach' is in wm_nodes\.environments\.maniskill\.tasks and in double_tasks"),
     ],

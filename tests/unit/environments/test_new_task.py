@@ -11,7 +11,7 @@ from own_packages import own_package
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.seed_ranges import MODEL_EPISODES
-from wm_nodes.config.tasks import VARIABLE, get_task, model_tasks, success
+from wm_nodes.config.tasks import VARIABLE, get_task, model_tasks
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.episodes import planned_episode, scripted_episode
@@ -129,7 +129,7 @@ def test_a_judge_of_its_recordings_decides_whether_it_is_done_and_refuses_what_t
     config = load_config("smoke", small)
     bags = collect_plan(scripted_plan(config, RECORDINGS, MODEL_EPISODES), config, tmp_path / "bags")
     recorded = [episode for bag in bags for episode in read_episodes(bag)]
-    episodes = stack_episodes(recorded, ("nudge",), success)
+    episodes = stack_episodes(recorded, ("nudge",))
     tokenizer, _ = train_tokenizer(episodes, config, 0, None)
     action, _ = train_action_model(tokenizer, episodes, config, 0, None)
     probe, _ = train_position_probe(episodes, config, 0, None)

@@ -12,7 +12,7 @@ from judge_server import PickyServer, serving
 from scripted_judge import make_clip, make_task
 
 from wm_nodes.config.judge import JudgeConfig
-from wm_nodes.config.load import default_judge
+from wm_nodes.config.load import load_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.judge.agent.contract import pause_reason
 from wm_nodes.judge.agent.types import Status
@@ -37,7 +37,7 @@ def server() -> Iterator[PickyServer]:
 
 def settings(server: PickyServer, **changes: object) -> JudgeConfig:
     values = {"endpoints": [server.url], "model": "first", "tries": 1}
-    return JudgeConfig.model_validate({**default_judge().model_dump(), **values, **changes})
+    return JudgeConfig.model_validate({**load_config("base").judge.model_dump(), **values, **changes})
 
 
 def jobs(count: int = NUM_CLIPS) -> list[ClipJob]:
@@ -49,7 +49,7 @@ def judges(verdicts: list[Verdict]) -> set[str]:
 
 
 def embedded(**changes: object) -> JudgeConfig:
-    return JudgeConfig.model_validate({**default_judge().model_dump(), "kind": "embedded", **changes})
+    return JudgeConfig.model_validate({**load_config("base").judge.model_dump(), "kind": "embedded", **changes})
 
 
 def test_while_no_server_answers_no_clip_has_a_reward_and_training_pauses_and_then_it_goes_on(
@@ -120,7 +120,7 @@ def test_beside_a_server_the_world_models_normal_ranges_are_evidence(server: Pic
 def test_an_embedded_judge_that_is_not_named_is_the_shipped_one_of_the_task_and_others_stay() -> None:
     nobody, here = {"kind": "embedded"}, {"kind": "embedded", "folder": "mine"}
     other, unnamed = {**here, "stages": ["TC"]}, {**nobody, "stages": ["PC"]}
-    values = {**default_judge().model_dump(), **nobody, "routes": [other, unnamed]}
+    values = {**load_config("base").judge.model_dump(), **nobody, "routes": [other, unnamed]}
     chosen, shipped = for_task(JudgeConfig.model_validate(values), "push_cube"), str(shipped_model("push_cube"))
     assert [chosen.folder, *(route.folder for route in chosen.routes)] == [shipped, "mine", shipped]
     with pytest.raises(ValueError, match=r"no judge is shipped for task 'pull_cube' .*judge calibrate"):
@@ -138,4 +138,4 @@ def test_an_embedded_judge_that_is_not_named_is_the_shipped_one_of_the_task_and_
 def test_a_route_to_nobody_is_refused_by_name(route: dict[str, object], words: str) -> None:
     server = {"endpoints": ["http://a/v1"], "model": "first", "routes": [{**route, "stages": ["TC"]}]}
     with pytest.raises(ValueError, match=words):
-        check_judge(JudgeConfig.model_validate({**default_judge().model_dump(), **server}))
+        check_judge(JudgeConfig.model_validate({**load_config("base").judge.model_dump(), **server}))

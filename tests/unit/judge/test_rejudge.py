@@ -16,7 +16,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from wm_nodes.apps.cli import main
 from wm_nodes.config.judge import JudgeConfig
-from wm_nodes.config.load import default_judge
+from wm_nodes.config.load import load_config
 from wm_nodes.judge.rejudge import JudgedBag, judge_bag
 from wm_nodes.judge.service import JudgeService
 from wm_nodes.reward import RewardResult
@@ -56,7 +56,7 @@ def judged(bag: Path, server: PickyServer, reads: Path | None = None) -> tuple[J
     from wm_nodes.judge.episode_reward import EpisodeReward
 
     values = {"endpoints": [server.url], "model": "judge", "tries": 1, "repeat_share": 0.0}
-    settings = JudgeConfig.model_validate({**default_judge().model_dump(), **values})
+    settings = JudgeConfig.model_validate({**load_config("base").judge.model_dump(), **values})
     with closing(JudgeService(settings, seed=0, reads=reads)) as judge:
         return judge_bag(bag, judge), EpisodeReward(judge).version
 

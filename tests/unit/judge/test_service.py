@@ -22,7 +22,7 @@ from video_toys import changed_judge
 
 from wm_nodes.apps.cli import main
 from wm_nodes.config.judge import JudgeConfig
-from wm_nodes.config.load import default_judge, dump_config, judge_overrides, load_config, load_video_config
+from wm_nodes.config.load import dump_config, judge_overrides, load_config, load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.lockstep import LockStep
 from wm_nodes.core.named_files import NamedFiles, OutsideFolders
@@ -43,7 +43,7 @@ SPEC = make_spec(num_envs=2, height=8, width=8)
 
 def settings(server: PickyServer, **changes: object) -> JudgeConfig:
     values = {"endpoints": [server.url], "model": "judge", "tries": 1, **changes}
-    return JudgeConfig.model_validate({**default_judge().model_dump(), **values})
+    return JudgeConfig.model_validate({**load_config("base").judge.model_dump(), **values})
 
 
 def jobs(count: int) -> list[ClipJob]:
@@ -274,7 +274,7 @@ def test_settings_that_name_no_judge_are_refused_by_name_and_no_key_is_repeated(
     changes: dict[str, object], words: str
 ) -> None:
     with pytest.raises(ValueError, match=words) as error:
-        check_judge(JudgeConfig.model_validate({**default_judge().model_dump(), **changes}))
+        check_judge(JudgeConfig.model_validate({**load_config("base").judge.model_dump(), **changes}))
     assert "sk-secret" not in str(error.value)
 
 

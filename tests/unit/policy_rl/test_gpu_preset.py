@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 from model_folders import spec_of
 from pretended_device import Device
-from pushing_scene import episode, success
+from pushing_scene import episode, stacked_scene
 from safetensors.torch import save_file
 from torch import nn
 
@@ -13,7 +13,6 @@ from wm_nodes.config.load import load_config
 from wm_nodes.policy_rl.device_rollout import DeviceCollector
 from wm_nodes.policy_rl.factories import make_endogenous_reward, make_policy, make_training_environment
 from wm_nodes.policy_rl.ppo import PpoLearner
-from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.world_model import ActionModel, Tokenizer, save_model_folder
 from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
@@ -41,7 +40,7 @@ def test_the_environment_has_about_65_million_parameters_and_1024_places() -> No
 def test_it_trains_a_model_and_a_policy_on_a_device(device: Device, tmp_path: Path) -> None:
     config = load_config("gpu", {"task": "push_cube", "device": device.name, "simulation.cameras": ["side"]} | TOY)
     tasks = ("push_cube", "reach")
-    episodes = stack_episodes([episode(i, num_steps=4, size=128) for i in range(4)], tasks, success)
+    episodes = stacked_scene([episode(i, num_steps=4, size=128) for i in range(4)], tasks)
     tokenizer, _ = train_tokenizer(episodes, config, 0, None)
     action, _ = train_action_model(tokenizer, tokenise_episodes(tokenizer, episodes), config, 0, None)
     folder = save_model_folder(

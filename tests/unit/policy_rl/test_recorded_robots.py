@@ -18,7 +18,7 @@ from wm_nodes.core.types import Episode
 from wm_nodes.environments.batch import EnvironmentBatch
 from wm_nodes.policy_rl.factories import make_imagined_environment, make_policy
 from wm_nodes.policy_rl.initial_policy import STARTS
-from wm_nodes.policy_rl.pretraining import model_from_recordings
+from wm_nodes.policy_rl.pretraining import model_from_data, read_recordings
 from wm_nodes.recording import EpisodeBagWriter
 from wm_nodes.world_model import (
     ActionModel,
@@ -63,6 +63,11 @@ def record(folder: Path, count: int = 12, **changes: Any) -> Path:
     return folder
 
 
+def model_of(bag: Path, config: RunConfig, run_dir: Path) -> Path:
+    """The folder of a model that is trained on a bag."""
+    return model_from_data(*read_recordings([bag], config), config, run_dir / "model")
+
+
 @pytest.fixture
 def config() -> RunConfig:
     torch.set_num_threads(1)
@@ -74,7 +79,7 @@ def test_an_arm_without_any_state_is_modelled_and_acted_on_by_its_pictures_alone
     kind: str, config: RunConfig, tmp_path: Path
 ) -> None:
     config = config.with_values(tokenizer=config.tokenizer.with_values(kind=kind))
-    folder = model_from_recordings([record(tmp_path / "bag", **NO_STATE)], config, tmp_path)
+    folder = model_of(record(tmp_path / "bag", **NO_STATE), config, tmp_path)
     assert load_model_folder(folder).action.state_change is None
     imagined = make_imagined_environment(config, folder, folder / STARTS, num_envs=2, seed=0)
     shown = imagined.reset()
@@ -85,7 +90,7 @@ def test_an_arm_without_any_state_is_modelled_and_acted_on_by_its_pictures_alone
 
 def test_a_measured_state_is_predicted_by_a_model_of_tokens_too(config: RunConfig, tmp_path: Path) -> None:
     config = config.with_values(tokenizer=config.tokenizer.with_values(kind="lfq"))
-    folder = model_from_recordings([record(tmp_path / "bag")], config, tmp_path)
+    folder = model_of(record(tmp_path / "bag"), config, tmp_path)
     models = load_model_folder(folder)
     assert models.action.state_change is not None and models.action.state_change.measured == (0, 1, 2, 3, 4, 5)
     imagined = make_imagined_environment(config, folder, folder / STARTS, num_envs=2, seed=0)
@@ -94,7 +99,7 @@ def test_a_measured_state_is_predicted_by_a_model_of_tokens_too(config: RunConfi
 
 
 def test_a_policy_scales_measured_states_by_what_was_recorded(config: RunConfig, tmp_path: Path) -> None:
-    folder = model_from_recordings([record(tmp_path / "bag")], config, tmp_path)
+    folder = model_of(record(tmp_path / "bag"), config, tmp_path)
     policy, recorded = make_policy(config, folder), load_model_folder(folder).action.condition
     torch.testing.assert_close(policy.state_shift_S, recorded.state_mean)
     torch.testing.assert_close(policy.state_scale_S, recorded.state_scale)

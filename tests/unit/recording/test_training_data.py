@@ -37,15 +37,16 @@ def write(folder: Path, listed: Sequence[Episode], spec: EnvironmentSpec = SPEC)
 
 
 def read(*bags: Path, num_heldout: int = 128) -> TrainingData:
-    return read_training_data(bags, num_heldout=num_heldout, seed=0)
+    return read_training_data(bags, num_heldout=num_heldout, seed=0)[0]
 
 
 def test_every_episode_is_on_one_side_and_both_kinds_are_on_both(tmp_path: Path) -> None:
-    data = read(write(tmp_path / "bag", episodes(12)))
+    bag = write(tmp_path / "bag", episodes(12))
+    data, whole = read_training_data([bag], num_heldout=128, seed=0)
     sides = [{image.tobytes() for image in side.images[:, 0]} for side in (data.training, data.heldout)]
     assert (len(data.training), len(data.heldout)) == (9, 3) and not sides[0] & sides[1]
     assert [int(side.success.any((1, 2)).sum()) for side in (data.training, data.heldout)] == [3, 1]
-    assert [episode.images[0].tobytes() in sides[0] for episode in data.episodes] == [True] * 9
+    assert [episode.images[0].tobytes() in sides[0] for episode in whole] == [True] * 9 and data.num_episodes == 9
     assert data.summary == (
         "maniskill/push_cube, task stir_the_pot: 2 x 8 x 6 px (front, wrist), 3 actions, 0 commanded and 3 measured "
         "state values",

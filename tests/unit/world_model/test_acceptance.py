@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 from model_folders import spec_of
-from pushing_scene import episode, success
+from pushing_scene import episode, stacked_scene
 from rich.console import Console
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
+from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.world_model import WorldModels
 from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.folder import read_world_manifest
@@ -267,7 +267,7 @@ def test_a_truth_without_positions_is_judged_by_what_the_pictures_said_when_the_
 
 @pytest.fixture(scope="module")
 def heldout() -> EpisodeArrays:
-    return stack_episodes((episode(seed) for seed in range(6)), TASKS, success)
+    return stacked_scene((episode(seed) for seed in range(6)), TASKS)
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 from model_folders import spec_of
-from pushing_scene import MAX_ACTION_M, episode, success
+from pushing_scene import MAX_ACTION_M, episode, stacked_scene
 
 from wm_nodes.config.load import load_config
 from wm_nodes.environments.maniskill.spec import simulation_spec
-from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
+from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.world_model import WorldModels
 from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
@@ -31,7 +31,7 @@ SPEC = replace(
 
 
 def arrays(count: int, first_seed: int = 0) -> EpisodeArrays:
-    return stack_episodes([episode(first_seed + i) for i in range(count)], ("push_cube",), success)
+    return stacked_scene([episode(first_seed + i) for i in range(count)], ("push_cube",))
 
 
 @pytest.fixture(scope="module")
@@ -88,5 +88,5 @@ def test_a_model_that_ignores_actions_loses_nothing_by_others(models: WorldModel
 @pytest.mark.slow
 def test_episodes_count_up_to_the_end_of_the_shorter_one_of_both(models: WorldModels) -> None:
     long, short = episode(1), episode(2, num_steps=4)
-    metrics = controllability_metrics(models, stack_episodes([long, short], ("push_cube",), success), SPEC)
+    metrics = controllability_metrics(models, stacked_scene([long, short], ("push_cube",)), SPEC)
     assert "tool_command_cm_h04" in metrics and "tool_command_cm_h08" not in metrics

@@ -6,11 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 from model_folders import spec_of
-from pushing_scene import episode, success
+from pushing_scene import episode, stacked_scene
 from torch import Tensor
 
 from wm_nodes.config.load import load_config
-from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.world_model import load_model_folder, save_model_folder
 from wm_nodes.world_model.decoding import choose_codes, code_parts, code_targets, decided_after, decode_frame
 from wm_nodes.world_model.quantizer import indices_to_bits
@@ -149,7 +148,7 @@ def test_a_token_model_learns_a_scene_and_imagines_it_behind_the_environment_int
         "tokenizer.learning_rate": 3e-3, "world_model.width": 32, "world_model.depth": 1, "world_model.num_heads": 2,
         "world_model.num_iterations": 60, "world_model.batch_size": 16, "world_model.learning_rate": 3e-3,
     })
-    episodes = stack_episodes([episode(i) for i in range(60)], ("push_cube",), success)
+    episodes = stacked_scene([episode(i) for i in range(60)], ("push_cube",))
     tokenizer, _ = train_tokenizer(episodes, config, 0, None)
     data = tokenise_episodes(tokenizer, episodes)
     model, metrics = train_token_model(tokenizer, data, config, 0, tmp_path)

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 from model_folders import spec_of
-from pushing_scene import episode, success
+from pushing_scene import episode, stacked_scene
 from torch import Tensor
 
 from wm_nodes.config.load import load_config
-from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
+from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.world_model import ActionModel, TextModel, Tokenizer, WorldModels
 from wm_nodes.world_model.dynamics import Prediction
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
@@ -49,7 +49,7 @@ def tokenizer() -> Tokenizer:
 
 
 def arrays(count: int, first_seed: int = 0) -> EpisodeArrays:
-    return stack_episodes([episode(first_seed + i) for i in range(count)], ("push_cube",), success)
+    return stacked_scene([episode(first_seed + i) for i in range(count)], ("push_cube",))
 
 
 def models(tokenizer: Tokenizer, text: TextModel | None) -> WorldModels:

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pushing_scene import episode, success
+from pushing_scene import episode, stacked_scene
 
 from wm_nodes.config.load import load_config
-from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
+from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.positions import columns_of, probe_targets
 from wm_nodes.world_model.training.position_probe import train_position_probe
@@ -16,7 +16,7 @@ OBJECT = columns_of("push_cube", "object")
 
 
 def arrays(count: int, first_seed: int = 0) -> EpisodeArrays:
-    return stack_episodes([episode(first_seed + i) for i in range(count)], ("push_cube", "reach"), success)
+    return stacked_scene([episode(first_seed + i) for i in range(count)], ("push_cube", "reach"))
 
 
 @pytest.mark.slow

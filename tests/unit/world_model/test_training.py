@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from model_folders import spec_of
-from pushing_scene import episode, success
+from pushing_scene import episode, stacked_scene
 from torch.testing import assert_close
 
 from wm_nodes.config.load import load_config
@@ -55,7 +55,7 @@ def config_of(**overrides: object) -> RunConfig:
 
 
 def arrays(count: int, first_seed: int = 0) -> EpisodeArrays:
-    return stack_episodes([episode(first_seed + i) for i in range(count)], TASKS, success)
+    return stacked_scene([episode(first_seed + i) for i in range(count)], TASKS)
 
 
 def test_on_another_table_only_the_object_is_foreground_where_it_is_what_differs_from_its_surroundings() -> None:
@@ -151,7 +151,7 @@ def test_done_heads_learn_from_different_episodes_unless_there_is_one() -> None:
 
 
 def test_shorter_episodes_are_padded_by_their_last_frame_and_masked() -> None:
-    stacked = stack_episodes([episode(0, num_steps=4), episode(1, num_steps=2)], TASKS, success)
+    stacked = stack_episodes([episode(0, num_steps=4), episode(1, num_steps=2)], TASKS)
     assert stacked.step_mask.tolist() == [[True] * 4, [True, True, False, False]]
     np.testing.assert_array_equal(stacked.images[1, 4], stacked.images[1, 2])
     assert stacked.success.shape == (2, 5, 2)
@@ -159,9 +159,9 @@ def test_shorter_episodes_are_padded_by_their_last_frame_and_masked() -> None:
 
 def test_episodes_of_different_cameras_are_refused() -> None:
     with pytest.raises(ValueError, match="different image"):
-        stack_episodes([episode(0, size=32), episode(1, size=64)], TASKS, success)
+        stack_episodes([episode(0, size=32), episode(1, size=64)], TASKS)
     with pytest.raises(ValueError, match="no episodes"):
-        stack_episodes([], TASKS, success)
+        stack_episodes([], TASKS)
 
 
 def test_a_resumed_run_takes_the_same_steps_as_one_that_was_not_stopped(tmp_path: Path) -> None:

@@ -6,11 +6,11 @@ from typing import Any
 import pytest
 import torch
 from pretended_device import Device
-from pushing_scene import episode, success
+from pushing_scene import episode, stacked_scene
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
+from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.decoder import train_decoder
@@ -32,7 +32,7 @@ def config_of(device: str, iterations: int, **overrides: Any) -> RunConfig:
 
 
 def make_episodes() -> EpisodeArrays:
-    made = stack_episodes([episode(i, num_steps=STEPS, size=64) for i in range(4)], ("push_cube", "reach"), success)
+    made = stacked_scene([episode(i, num_steps=STEPS, size=64) for i in range(4)], ("push_cube", "reach"))
     last_only = torch.zeros(made.success.shape, dtype=torch.bool).numpy()
     last_only[:, -1] = True
     return replace(made, behaviours=("expert",) * len(made), success=last_only)

@@ -156,10 +156,10 @@ def open_run(
 
 
 def _full_paths(value: Any) -> Any:
-    """An option's value as the record holds it: paths in full, also that of a preset's file."""
+    """An option's value as the record holds it: paths in full, also that of a preset's or a task's file."""
     if isinstance(value, list):
         return [_full_paths(part) for part in value]
-    if isinstance(value, Path) or Path(str(value)).suffix in {".yaml", ".yml"}:
+    if isinstance(value, Path) or Path(str(value)).suffix in {".yaml", ".yml", ".py"}:
         return str(Path(value).expanduser().resolve())
     return value
 

@@ -9,15 +9,14 @@ what passed, what failed, and what could not be judged. The folder alone goes on
 
 import argparse
 import json
-import os
 import shlex
-import sys
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from wm_nodes.apps import options
+from wm_nodes.config.extensions import SUFFIX, name_file
 from wm_nodes.config.load import ConfigError, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import VARIABLE, check_task
@@ -26,7 +25,6 @@ from wm_nodes.core.errors import ModelNotAcceptedError
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.policy_rl.pretraining import model_from_data, read_recordings
-from wm_nodes.recording import read_spec
 from wm_nodes.reports.stages import Stages, console
 from wm_nodes.training.run_record import Starter
 from wm_nodes.world_model.folder import read_world_manifest
@@ -69,7 +67,8 @@ def run(arguments: argparse.Namespace) -> None:
         stage(f"run folder {folder}")
         model = folder / MODEL
         if arguments.data is not None:
-            model_from_data(arguments.data, config, model, command=arguments.command, say=stage)
+            data, starts = arguments.data
+            model_from_data(data, starts, config, model, command=arguments.command, say=stage)
         report = _judge(config, model)
         stage(f"acceptance {report.words}")
         following = f"--model-dir {model} --demos {shlex.join(map(str, arguments.bags))} --evaluation.environment none"
@@ -90,11 +89,9 @@ def opened(arguments: argparse.Namespace) -> AbstractContextManager[tuple[RunCon
         compute_device(config.device)
         if not arguments.bags:
             raise ConfigError("name recordings with --bags")
-        bags = [Path(bag) for bag in arguments.bags]
-        if arguments.task:
-            _check_task(arguments.task, bags)
+        task = _task_of(arguments.task) if arguments.task else ""
         is_made = arguments.run_dir and (arguments.run_dir.expanduser() / MODEL / MANIFEST).exists()
-        arguments.data = None if is_made else read_recordings(bags, config)
+        arguments.data = None if is_made else read_recordings([*map(Path, arguments.bags)], config, task)
 
     starter = Starter("train-model", _load, FIXED, {}, options.OPTION_OF, prefix="--")
     return options.open_run(
@@ -106,19 +103,14 @@ def _load(file: str, settings: dict[str, Any], chosen: object) -> RunConfig:
     return load_config(file, {**settings, "task": ""})
 
 
-def _check_task(given: str, bags: list[Path]) -> None:
-    """Find the task, also in a file of its own, and compare it with the recordings'."""
+def _task_of(given: str) -> str:
+    """The name of a known task, or of one in a file, which is known from then on. Raises ConfigError, ValueError."""
     file = Path(given)
-    if file.suffix == ".py":
-        if not file.is_file():
-            raise ConfigError(f"--task {given} is no file")
-        sys.path.insert(0, str(file.resolve().parent))
-        os.environ[VARIABLE] = ",".join(filter(None, (os.environ.get(VARIABLE, ""), file.stem)))
-    name = check_task(file.stem if file.suffix == ".py" else given)
-    for bag in bags:
-        if (recorded := read_spec(bag).task) != name:
-            raise ConfigError(f"{bag} was recorded for task {recorded!r}, not {name!r}; leave --task out to take the "
-                              "recorded success flags")
+    if file.suffix != SUFFIX:
+        return check_task(given)
+    if not file.is_file():
+        raise ConfigError(f"--task {given} is no file")
+    return check_task(name_file(file, VARIABLE))
 
 
 def _judge(config: RunConfig, model: Path) -> AcceptanceReport:

@@ -76,11 +76,6 @@ def _load(schema: type[Config], loop: str, preset: str, overrides: dict[str, Any
         raise refusal(error, f"{schema.__module__.replace('.', '/')}.py", file) from None
 
 
-def default_judge() -> JudgeConfig:
-    """The judge of both loops, as presets/judge.yaml sets it."""
-    return JudgeConfig.model_validate(read_yaml(PRESETS / "judge.yaml")["judge"])
-
-
 def reward_overrides(reward: str | None) -> dict[str, Any]:
     """Return the setting of loop 2 for one of REWARDS: the weights of the rewards; {} for None."""
     if reward is None:

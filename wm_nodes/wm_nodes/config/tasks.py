@@ -1,9 +1,9 @@
 """What a task is, and where the files of the tasks are found.
 
-A task is one file, <name>.py, with TASK = Task(...), in a folder `tasks` of a simulator's package or in a package that
-VARIABLE names. A robot's task is its instruction; what a simulator, a world model and the judge ask of it are parts.
-Files are imported when a task is asked for, so that every layer may ask. Standard library only: launch files list the
-tasks too. Shapes: P ground truth, A action, S state.
+A task is one file, <name>.py, with TASK = Task(...), in a folder `tasks` of a simulator's package or one that VARIABLE
+names, itself or by its package. A robot's task is its instruction; what a simulator, a world model and the judge ask of
+it are parts. Files are imported when a task is asked for, so that every layer may ask. Standard library only: launch
+files list the tasks too. Shapes: P ground truth, A action, S state.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 FOLDER = "tasks"
 VARIABLE = "WM_TASKS"
-"""Environment variable with the names of further packages of task files, separated by commas."""
+"""Environment variable with the names of further packages of task files, or full paths of such files, separated by
+commas."""
 
 
 @dataclass(frozen=True)
@@ -234,6 +235,14 @@ def success(task: str, ground_truth: Floats) -> NDArray[np.bool_]:
     if rule is None:
         raise ValueError(f"task {task!r} has no success rule in its file; take the flag that was recorded")
     return rule(ground_truth)
+
+
+def success_or_recorded(task: str, ground_truth: Floats, recorded: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether `task` is done in each (..., P) ground truth by its rule, or without a rule or ground truth as recorded.
+
+    recorded: (...,), the flags.
+    """
+    return success(task, ground_truth) if has_rule(task) and ground_truth.shape[-1] else recorded
 
 
 def instruction(task: str, scenes: str) -> str:

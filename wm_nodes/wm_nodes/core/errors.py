@@ -1,5 +1,7 @@
 """Errors that more than one room raises: their text says what happened and what to do."""
 
+from collections.abc import Sequence
+
 
 class RunError(RuntimeError):
     """A run cannot go on, for a reason outside of this program, e.g. a node that ended."""
@@ -15,3 +17,9 @@ class WireError(Exception):
     def __init__(self, code: int, text: str) -> None:
         super().__init__(text)
         self.code = code
+
+
+def first_few(texts: Sequence[str], most: int = 5) -> str:
+    """The first of several texts, and how many more there are."""
+    more = f"; and {len(texts) - most} more" if len(texts) > most else ""
+    return "; ".join(texts[:most]) + more

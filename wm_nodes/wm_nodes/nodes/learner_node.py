@@ -17,7 +17,7 @@ from wm_msgs.msg import EnvSpec, ErrorCode, RewardBatch, TransitionBatch
 from wm_msgs.srv import GetWeights, SaveCheckpoint
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import AGENT
-from wm_nodes.core.errors import WireError
+from wm_nodes.core.errors import WireError, first_few
 from wm_nodes.core.lockstep import DroppedTransitions
 from wm_nodes.core.named_files import NamedFiles
 from wm_nodes.core.specs import EnvironmentSpec
@@ -220,8 +220,7 @@ class LearnerNode(TrainingNode):
             f"{source} {made} rollouts of {steps} lock-steps (ppo.num_steps) by the versions that were trained, not "
             f"{goal.updates}; the next needed is of version {version}: start from the recorded run's first weights"
         )
-        more = f", and {len(left_out) - 3} more" if len(left_out) > 3 else ""
-        return text + (f"; left out: {'; '.join(left_out[:3])}{more}" if left_out else "")
+        return text + (f"; left out: {first_few(left_out, 3)}" if left_out else "")
 
     def _count_dropped(self, dropped: DroppedTransitions) -> None:
         for key, number in (("invalid", dropped.invalid), ("gap", dropped.gap), ("stale", dropped.stale)):

@@ -65,24 +65,22 @@ def write_starts(
                 break
             counts[episode.task] += 1
             chosen.append(episode)
-    return write_episode_starts(chosen, path, tasks=tasks, frames=frames, seed=seed)
+    write_atomic(path, save(episode_starts(chosen, tasks=tasks, frames=frames, seed=seed)))
+    return len(chosen)
 
 
-def write_episode_starts(
-    chosen: Sequence[Episode], path: Path, *, tasks: Sequence[str] = (), frames: Literal["first", "any"] = "first",
-    seed: int = 0,
-) -> int:
-    """write_starts of these episodes."""
+def episode_starts(
+    chosen: Sequence[Episode], *, tasks: Sequence[str] = (), frames: Literal["first", "any"] = "first", seed: int = 0
+) -> dict[str, torch.Tensor]:
+    """What write_starts writes of these episodes, by name."""
     stream = numpy_stream(seed, "start_frames")
     rows = [int(stream.integers(frames_before_success(e, tasks))) if frames == "any" else 0 for e in chosen]
-    tensors = {
+    return {
         "images": torch.from_numpy(np.stack([episode.images[row] for episode, row in zip(chosen, rows)])),
         "states": torch.from_numpy(np.stack([episode.states[row] for episode, row in zip(chosen, rows)])),
         INSTRUCTIONS: pack_instructions(chosen),
         **({"seeds": torch.tensor([e.seed for e in chosen], dtype=torch.int64)} if frames == "first" else {}),
     }
-    write_atomic(path, save(tensors))
-    return len(chosen)
 
 
 def write_round_starts(config: RunConfig, first_frames: Path, bags: Iterable[Path], path: Path) -> None:

@@ -11,12 +11,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors.torch import save
+from torch import Tensor
 
 from wm_nodes.config.scenes import splits
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT, MODEL_EPISODES, WEAK_POLICIES, seed_spans
 from wm_nodes.config.tasks import get_task, model_tasks, recorded_task
 from wm_nodes.core.device import compute_device, device_label, explain_memory
+from wm_nodes.core.files import write_atomic
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.seeding import initial_weights
 from wm_nodes.core.specs import EnvironmentSpec, tool_spec
@@ -26,8 +29,8 @@ from wm_nodes.policy_rl.factories import STARTS, policy_actor
 from wm_nodes.policy_rl.initial_policy import (
     MAX_STARTS,
     MODEL_STARTS,
+    episode_starts,
     train_weak_policy,
-    write_episode_starts,
     write_starts,
 )
 from wm_nodes.recording import read_episodes, read_spec
@@ -129,27 +132,24 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
     return folder
 
 
-def model_from_recordings(bags: Sequence[Path], config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
-    """model_from_data of bags, unless run_dir/model is there."""
-    folder = run_dir / "model"
-    if (folder / MANIFEST).exists():
-        return folder
-    return model_from_data(read_recordings(bags, config), config, folder, command=command)
+def read_recordings(bags: Sequence[Path], config: RunConfig, task: str = "") -> tuple[TrainingData, dict[str, Tensor]]:
+    """Read what a world model is trained on, and the frames that are imagined from beside it (see episode_starts).
 
-
-def read_recordings(bags: Sequence[Path], config: RunConfig) -> TrainingData:
-    """Read what a world model is trained on.
+    Args:
+        task: that the bags must be of; empty: any.
 
     Raises:
         BagError: as read_training_data. ValueError: tokenizer.patch_px does not fit the pictures.
     """
-    spec = read_spec(bags[0])
-    Tokenizer(config.tokenizer, spec.height, spec.width, 0)  # refuses pictures before all of them are read
-    return read_training_data(bags, num_heldout=config.data.num_heldout, seed=config.seed)
+    data, episodes = read_training_data(
+        bags, num_heldout=config.data.num_heldout, seed=config.seed, task=task,
+        check=lambda spec: Tokenizer(config.tokenizer, spec.height, spec.width, 0),
+    )
+    return data, episode_starts(episodes[:MAX_STARTS], frames=config.data.start_frames, seed=config.seed)
 
 
 def model_from_data(
-    data: TrainingData, config: RunConfig, folder: Path, *, command: str = "",
+    data: TrainingData, starts: dict[str, Tensor], config: RunConfig, folder: Path, *, command: str = "",
     say: Callable[[str], object] = lambda text: None,
 ) -> Path:
     """Train tokenizer and action model on the recorded episodes of one environment, whichever it is, and measure them
@@ -159,6 +159,7 @@ def model_from_data(
     reward.dense_weight to 0.
 
     Args:
+        starts: the first frames, as read_recordings gives them.
         say: gets a line for each stage.
     """
     device, run_dir = compute_device(config.device), folder.parent
@@ -182,14 +183,12 @@ def model_from_data(
     models = WorldModels(shown_by, action, None, data.tasks, tool_spec(spec), {}, probe)
     story = {
         "made": _made(command, config),
-        "data": {"episodes": len(data.episodes), "summary": list(data.summary)},
+        "data": {"episodes": data.num_episodes, "summary": list(data.summary)},
         "success_threshold": config.reward.success_threshold,
         "training": {"tokenizer": tokenizer_metrics, **dynamics_metrics},
         "heldout": plain(model_metrics(models, data.heldout, config)),
     }
-    write_episode_starts(
-        data.episodes[:MAX_STARTS], folder / STARTS, frames=config.data.start_frames, seed=config.seed
-    )
+    write_atomic(folder / STARTS, save(starts))
     return save_model_folder(
         folder, tokenizer, action, None, config, spec=spec, tasks=data.tasks, story=story, probe=probe,
         decoder=shown_by.decoder if shown_by is not tokenizer else None,

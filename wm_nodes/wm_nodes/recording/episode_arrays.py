@@ -1,17 +1,14 @@
 """Recorded episodes stacked for training. Shapes: E episodes, T steps, H W 3 image, J tasks, P truths."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.config.tasks import has_rule, parts_of, shares_scene, success
+from wm_nodes.config.tasks import parts_of, shares_scene, success_or_recorded
 from wm_nodes.core.types import BoolArray, Episode, FloatArray, UInt8Array
-
-TaskLabels = Callable[[str, FloatArray], BoolArray]
-"""(task name, ground truth (..., P)) -> success (...,)."""
 
 
 @dataclass(frozen=True)
@@ -104,12 +101,11 @@ def check_finite(episodes: Iterable[Episode]) -> None:
 
 
 def stack_episodes(
-    episodes: Iterable[Episode], tasks: Sequence[str], labels: TaskLabels = success, *, num_steps: int | None = None
+    episodes: Iterable[Episode], tasks: Sequence[str], *, num_steps: int | None = None
 ) -> EpisodeArrays:
     """Stack episodes of one camera set-up; longer ones are cut to num_steps (None: the longest decides).
 
-    A task without a rule in its file, or without ground truth, is done where its recorded episodes say so; `labels` are
-    those of the other tasks.
+    Whether a task is done is as in config.tasks.success_or_recorded.
 
     Raises:
         ValueError: no episodes, episodes of different image, state or action sizes, or as check_finite.
@@ -132,14 +128,11 @@ def stack_episodes(
         actions[row, : lengths[row]] = episode.actions[: lengths[row]]
     truth = np.stack([e.ground_truth[rows] for e, rows in zip(listed, frame_rows, strict=True)])
     said = np.stack([e.success[rows] for e, rows in zip(listed, frame_rows, strict=True)])
-    by_rule = filter(has_rule, tasks) if truth.shape[-1] else ()
-    with_rule = {*tasks} if labels is not success else {*by_rule}
     return EpisodeArrays(
         images=np.stack([e.images[rows] for e, rows in zip(listed, frame_rows, strict=True)]),
         states=np.stack([s[rows] for s, rows in zip(tool_states, frame_rows, strict=True)]), actions=actions,
-        ground_truth=truth, success=np.stack([
-            np.asarray(labels(task, truth) if task in with_rule else said, bool) for task in tasks
-        ], -1),
+        ground_truth=truth,
+        success=np.stack([np.asarray(success_or_recorded(task, truth, said), bool) for task in tasks], -1),
         lengths=lengths, tasks=tuple(tasks), instructions=tuple(e.instruction for e in listed),
         behaviours=tuple(e.behaviour for e in listed), recorded_tasks=tuple(
             own[int(e.states[0, -len(own) :].argmax())] if own else e.task for e, own in zip(listed, parts, strict=True)

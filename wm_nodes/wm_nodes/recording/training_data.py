@@ -1,7 +1,7 @@
 """Recordings as the data of a world model: which episodes are trained on, which are held out, what was lost and why.
 Shapes: E episodes, J tasks."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.config.tasks import has_rule, model_tasks, success
+from wm_nodes.config.tasks import model_tasks, success_or_recorded
+from wm_nodes.core.errors import first_few
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import MODEL_FIELDS, EnvironmentSpec
 from wm_nodes.core.types import BoolArray, Episode
@@ -22,7 +23,6 @@ PART_STEPS = 64
 MIN_EPISODES, MIN_SUCCESSES = 8, 2
 """So that two episodes are held out, and one that succeeds is on either side."""
 HELDOUT_SHARE = 0.25
-MOST_NAMED = 5
 
 
 @dataclass(frozen=True)
@@ -37,23 +37,31 @@ class TrainingData:
     """Episodes or their parts."""
     heldout: EpisodeArrays
     """The same of other episodes, never trained on."""
-    episodes: tuple[Episode, ...]
-    """Those that are trained on, whole."""
+    num_episodes: int
+    """How many are trained on, whole ones."""
     summary: tuple[str, ...]
     """What was used, what was lost and why, a line each."""
 
 
-def read_training_data(bags: Sequence[Path], *, num_heldout: int, seed: int) -> TrainingData:
+def read_training_data(
+    bags: Sequence[Path], *, num_heldout: int, seed: int, task: str = "",
+    check: Callable[[EnvironmentSpec], object] = lambda spec: None,
+) -> tuple[TrainingData, list[Episode]]:
     """Read the complete episodes of bags and hold a share of those that succeed, and of those that do not, back.
 
     Args:
         num_heldout: most episodes to hold out; at most a quarter is, and at least one of each kind.
+        task: that the bags must be of; empty: any.
+        check: raises for a spec that is no use, before an episode is read.
+
+    Returns:
+        The data, and the episodes that are trained on, whole.
 
     Raises:
-        BagError: bags of different cameras, sizes, actions, states or tasks, without actions, without any success, or
-            with too few episodes.
+        BagError: bags of different cameras, sizes, actions, states or tasks, of another task, without actions, without
+            any success, or with too few episodes.
     """
-    spec = _common_spec(bags)
+    spec = _common_spec(bags, task, check)
     episodes, lost = _read(bags, spec)
     named = ", ".join(map(str, bags))
     if len(episodes) < MIN_EPISODES:
@@ -63,7 +71,7 @@ def read_training_data(bags: Sequence[Path], *, num_heldout: int, seed: int) -> 
     if all(np.ptp(np.concatenate([e.actions[:, i] for e in episodes])) == 0 for i in range(spec.action_dim)):
         raise BagError(f"every action in {named} is {episodes[0].actions[0].tolist()}, so nothing shows what actions "
                        "do; record while the robot is commanded")
-    won = np.array([_succeeds(episode, spec.task) for episode in episodes])
+    won = np.array([success_or_recorded(spec.task, e.ground_truth, e.success)[1:].any() for e in episodes], bool)
     if won.sum() < MIN_SUCCESSES:
         raise BagError(f"{won.sum()} of {len(won)} episodes in {named} succeed, and {MIN_SUCCESSES} are needed, to "
                        "learn when the task is done and to judge that; record successes, and set the success flag of "
@@ -78,13 +86,19 @@ def read_training_data(bags: Sequence[Path], *, num_heldout: int, seed: int) -> 
                        num_steps=most if spec.ground_truth_names else longest)
         for is_held in (False, True)
     )
-    chosen = tuple(episode for episode, its in zip(episodes, held) if not its)
-    return TrainingData(spec, tasks, training, heldout, chosen, (*_used(spec, episodes, parts, won, held), *lost))
+    chosen = [episode for episode, its in zip(episodes, held) if not its]
+    summary = *_used(spec, episodes, parts, won, held), *lost
+    return TrainingData(spec, tasks, training, heldout, len(chosen), summary), chosen
 
 
-def _common_spec(bags: Sequence[Path]) -> EnvironmentSpec:
-    """The spec that all bags have, checked before any episode is read."""
-    first, *others = [read_spec(bag) for bag in bags]
+def _common_spec(bags: Sequence[Path], task: str, check: Callable[[EnvironmentSpec], object]) -> EnvironmentSpec:
+    """The spec that all bags have, checked before any episode is read. Arguments: as of read_training_data."""
+    first, *others = specs = [read_spec(bag) for bag in bags]
+    for bag, spec in zip(bags, specs):
+        if task and spec.task != task:
+            raise BagError(f"{bag} was recorded for task {spec.task!r}, not {task!r}; leave --task out to take the "
+                           "recorded success flags")
+    check(first)
     if not first.action_dim:
         raise BagError(f"{bags[0]} was recorded without actions (its spec names none), and a world model learns what "
                        "actions do; record the commands of the robot too")
@@ -110,20 +124,12 @@ def _read(bags: Sequence[Path], spec: EnvironmentSpec) -> tuple[list[Episode], l
             lost.append(f"lost from {bag}: {_count(report.unfinished, 'episode')} cut off by the start or end of the "
                         "recording")
         if report.incomplete:
-            more = len(report.incomplete) - MOST_NAMED
             lost.append(f"lost from {bag}: {_count(len(report.incomplete), 'incomplete episode')} "
-                        f"({'; '.join(report.incomplete[:MOST_NAMED])}{f'; and {more} more' if more > 0 else ''})")
+                        f"({first_few(report.incomplete)})")
         if report.lost_steps:
             lost.append(f"lost from {bag}: {_count(report.lost_steps, 'message')} of wm/env/transition that the "
                         "recorder did not get")
     return episodes, lost or ["lost: nothing"]
-
-
-def _succeeds(episode: Episode, task: str) -> bool:
-    """By the task's rule where there is ground truth, else by the recorded flag."""
-    by_rule = has_rule(task) and episode.ground_truth.shape[1] > 0
-    done = success(task, episode.ground_truth) if by_rule else episode.success
-    return bool(done[1:].any())
 
 
 def _parts(episode: Episode, most: int) -> Iterator[Episode]:

@@ -22,12 +22,12 @@ import yaml
 
 from wm_nodes.config.load import RECORD, Config, ConfigError, read_yaml
 from wm_nodes.config.sections import SettingsSection
+from wm_nodes.core.errors import first_few
 from wm_nodes.core.files import write_atomic
 
 CONFIG, DEVICE, PRESET = "config.yaml", "device", "preset"
 HERE = "<run folder>/"
 """Stands in kept options for the folder that the record lies in, so that a run can be moved."""
-MOST_NAMED = 5
 
 
 @dataclass(frozen=True)
@@ -170,10 +170,9 @@ def keep_config(config: SettingsSection, folder: Path) -> None:
 def _refuse(folder: Path, differences: Mapping[str, tuple[Any, Any]]) -> None:
     if differences:
         named = [f"{name} is {old!r} in this run, {new!r} is given" for name, (old, new) in differences.items()]
-        more = f"; and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
         raise ConfigError(
-            f"{folder} was begun with other options: {'; '.join(named[:MOST_NAMED])}{more}. Leave them out to go on "
-            "with it, or begin another run folder"
+            f"{folder} was begun with other options: {first_few(named)}. Leave them out to go on with it, or begin "
+            "another run folder"
         )
 
 

@@ -11,7 +11,7 @@ from judge_server import PickyServer, serving
 from scripted_judge import CLEAN, COOKING, WRONG, ScriptedJudge, clean_table, make_clip, make_task
 
 from wm_nodes.config.judge import JudgeConfig
-from wm_nodes.config.load import ConfigError, default_judge, load_config
+from wm_nodes.config.load import ConfigError, load_config
 from wm_nodes.judge.agent.judge import Capabilities, Judge, Read, ReadRequest
 from wm_nodes.judge.agent.levels import next_vote
 from wm_nodes.judge.agent.machine import RewardAgent
@@ -96,7 +96,7 @@ def test_a_server_that_can_do_it_is_asked_for_letters_only_and_for_their_probabi
     with serving(PickyServer()) as server:
         ids = [5, 6, 7, 8, 9]
         values = {"endpoints": [server.url], "model": "judge", "choice_grammar": True, "label_token_ids": ids}
-        opened = make_judge(JudgeConfig.model_validate({**default_judge().model_dump(), **values}), RUBRIC)
+        opened = make_judge(JudgeConfig.model_validate({**load_config("base").judge.model_dump(), **values}), RUBRIC)
         clip = make_clip()
         request = ReadRequest(clip, make_task(clip), Stage.VQ, ("clarity",), Profile.S, (next_vote(1, 0),), ())
 
@@ -108,7 +108,7 @@ def test_a_server_that_can_do_it_is_asked_for_letters_only_and_for_their_probabi
         assert [read.status for read in asyncio.run(asked())] == [Status.OK]
     body = server.requests[-1]
     assert body["structured_outputs"] == {"choice": list("ABCDE")} and body["logprob_token_ids"] == ids
-    wrong = JudgeConfig.model_validate({**default_judge().model_dump(), **values, "label_token_ids": [1, 2]})
+    wrong = JudgeConfig.model_validate({**load_config("base").judge.model_dump(), **values, "label_token_ids": [1, 2]})
     with pytest.raises(ValueError, match=r"label_token_ids must hold 5 ids, of A to E, got \(1, 2\)"):
         make_judge(wrong, RUBRIC)
 
@@ -118,7 +118,7 @@ def clip_judge(first: PickyServer, second: PickyServer, **changes: object) -> An
     with serving(first), serving(second):
         route = {"stages": ["TC", "PC"], "endpoints": [second.url], "model": "second"}
         values = {"endpoints": [first.url], "model": "first", "tries": 1, "routes": [route], "mode": "benchmark"}
-        settings = JudgeConfig.model_validate({**default_judge().model_dump(), **values, **changes})
+        settings = JudgeConfig.model_validate({**load_config("base").judge.model_dump(), **values, **changes})
         with closing(JudgeService(settings, seed=0)) as judge:
             yield judge
 
@@ -153,7 +153,8 @@ def test_two_servers_share_the_stages_of_a_clip_and_where_one_is_down_there_is_n
     ids=["nobody", "twice"],
 )
 def test_routes_to_nobody_and_stages_with_two_judges_are_refused_by_name(routes: object, words: str) -> None:
-    values = {**default_judge().model_dump(), "endpoints": ["http://a/v1"], "model": "first", "routes": routes}
+    judge = load_config("base").judge.model_dump()
+    values = {**judge, "endpoints": ["http://a/v1"], "model": "first", "routes": routes}
     with pytest.raises(ValueError, match=words):
         check_judge(JudgeConfig.model_validate(values))
 

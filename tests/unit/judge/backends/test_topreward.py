@@ -15,7 +15,7 @@ from scripted_judge import make_clip, make_task
 
 from wm_nodes.apps.cli import main
 from wm_nodes.config.judge import JudgeConfig
-from wm_nodes.config.load import default_judge
+from wm_nodes.config.load import load_config
 from wm_nodes.judge.agent import topreward
 from wm_nodes.judge.agent.types import Stage, Status
 from wm_nodes.judge.agent.verdict import Verdict
@@ -33,7 +33,7 @@ TRUE_OR_FALSE = {"True": 0.5, " True": 0.1, "False": 0.2, "The": 0.2}
 
 def settings(server: ChatServer, **changes: Any) -> JudgeConfig:
     values = {"endpoints": [server.url], "model": "judge", "tries": 1, "mode": "topreward", "repeat_share": 0.0}
-    return JudgeConfig.model_validate({**default_judge().model_dump(), **values, **changes})
+    return JudgeConfig.model_validate({**load_config("base").judge.model_dump(), **values, **changes})
 
 
 def jobs(count: int, num_frames: int = 12) -> list[ClipJob]:

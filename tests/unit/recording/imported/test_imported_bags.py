@@ -33,7 +33,7 @@ from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
 from wm_nodes.core.specs import SOURCE_REAL
 from wm_nodes.core.types import Episode
-from wm_nodes.policy_rl.pretraining import model_from_recordings
+from wm_nodes.policy_rl.pretraining import model_from_data, read_recordings
 from wm_nodes.recording import Bag, RawBagWriter, read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.recording.imported import load_contract, survey
@@ -133,7 +133,8 @@ def test_a_foreign_bag_becomes_a_world_model(tmp_path: Path, capsys: pytest.Capt
     assert arrays.images.shape == (8, 21, 64, 128, 3)
     assert arrays.success[:, -1, 0].tolist() == [True, False] * 4
     torch.set_num_threads(1)
-    folder = model_from_recordings([out], load_config("smoke", TINY), tmp_path / "model")
+    config = load_config("smoke", TINY)
+    folder = model_from_data(*read_recordings([out], config), config, tmp_path / "model")
     models = load_model_folder(folder)
     assert models.tasks == ("pick_up_the_cup",) and models.spec.cameras == ("front", "wrist")
 

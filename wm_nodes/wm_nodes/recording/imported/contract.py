@@ -57,11 +57,15 @@ class Numbers(Source):
         return self.names or self.select
 
     @model_validator(mode="after")
-    def _same_lengths(self) -> Self:
-        lengths = {name: len(getattr(self, name)) for name in ("names", "low", "high") if getattr(self, name, None)}
+    def _named(self) -> Self:
+        if self.names:
+            self._check_one_for_each(names=self.names)
+        return self
+
+    def _check_one_for_each(self, **listed: tuple[object, ...]) -> None:
+        lengths = {name: len(values) for name, values in listed.items()}
         if wrong := {name: length for name, length in lengths.items() if length != len(self.select)}:
             raise ValueError(f"{self.topic} selects {len(self.select)} values, but has {wrong}; give one for each")
-        return self
 
 
 class Commands(Numbers):
@@ -79,7 +83,8 @@ class Commands(Numbers):
 
     @model_validator(mode="after")
     def _box(self) -> Self:
-        if any(low >= high for low, high in zip(self.low, self.high)):
+        self._check_one_for_each(low=self.low, high=self.high)
+        if any(low >= high for low, high in zip(self.low, self.high, strict=True)):
             raise ValueError(f"{self.topic}: low {self.low} must be below high {self.high}")
         return self
 
@@ -238,8 +243,8 @@ def load_contract(path: Path) -> Contract:
         contract = Contract.model_validate(values)
     except ValidationError as error:
         raise refusal(error, "wm_nodes/recording/imported/contract.py", str(path)) from None
-    rules, labels = contract.episodes, contract.episodes.success.file
-    if not labels:
+    rules = contract.episodes
+    if not rules.success.file:
         return contract
-    success = rules.success.model_copy(update={"file": str(path.parent / labels)})
-    return contract.model_copy(update={"episodes": rules.model_copy(update={"success": success})})
+    success = rules.success.with_values(file=str(path.parent / rules.success.file))
+    return contract.with_values(episodes=rules.with_values(success=success))

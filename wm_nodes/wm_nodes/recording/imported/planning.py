@@ -133,31 +133,23 @@ class Planner:
         return [episode for span in spans_of(self.streams, self.contract) for episode in self._of_span(span)]
 
     def _of_span(self, span: Span) -> list[PlannedEpisode]:
-        contract, tally = self.contract, self.tally
-        if (lasts_s := (span.end_ns - span.start_ns) / NS_PER_S) > LONGEST_S:
-            raise BagError(f"an episode in {self.name} lasts {lasts_s / 3600:.0f} h: a clock was set while it was "
-                           "recorded; set timeline to the other clock, or leave this bag out")
-        ticks = np.arange(span.start_ns, span.end_ns + 1, contract.period_ns, dtype=np.int64)
-        commands, commanded = self._commands(ticks)
-        moved = np.flatnonzero(commanded)
+        contract, tally, ticks = self.contract, self.tally, self._ticks(span)
+        commands, has = self._commands(ticks)
+        moved = np.flatnonzero(has.all(1))
         if not len(moved):
-            silent = [stream.place for stream in self._actions if not self._command(stream, ticks)[1].any()]
+            silent = [stream.place for stream, ever in zip(self._actions, has.any(0), strict=True) if not ever]
             tally.lost_episodes[f"without a command of {' and '.join(silent) or 'all topics at once'}"] += 1
             return []
-        first, end = moved[0], min(moved[-1] + 2, len(ticks))
-        tally.lost["before the first command or after the last"] += len(ticks) - (end - first)
-        ticks, commands, commanded = ticks[first:end], commands[first:end], commanded[first:end]
+        inside = slice(moved[0], moved[-1] + 2)
+        tally.lost["before the first command or after the last"] += len(ticks) - len(ticks[inside])
+        ticks, commands, has = ticks[inside], commands[inside], has[inside]
         instruction = self._instruction(span)
         if instruction is None:
             tally.lost_episodes["without an instruction"] += 1
             return []
-        seen = self._seen(ticks)
-        joined = seen[:-1] & seen[1:] & commanded[:-1]
-        success = self._success(ticks, span)
-        pictures = np.stack([stream.numbers[stream.newest(ticks)] for stream in self._images], 1)
-        states = np.concatenate(
-            [np.zeros((len(ticks), 0)), *(stream.values[stream.newest(ticks)] for stream in self._state)], 1
-        )
+        seen, success = self._seen(ticks, has), self._success(ticks, span)
+        joined = seen[:-1] & seen[1:] & has[:-1].all(1)
+        pictures, states = self._observations(ticks)
         commands = self._relative(commands, states)
         actions = self._scaled(commands)
         planned, covered = list[PlannedEpisode](), 0
@@ -178,17 +170,29 @@ class Planner:
             tally.lost_episodes["with a success at the end"] += 1
         return planned
 
-    def _seen(self, ticks: Times) -> BoolArray:
-        """(K,) whether every observed topic has a sample that is new enough; counts ticks without one, and gaps."""
-        seen = np.ones(len(ticks), bool)
+    def _ticks(self, span: Span) -> Times:
+        """(K,) of a span. Raises BagError: it lasts too long."""
+        if (lasts_s := (span.end_ns - span.start_ns) / NS_PER_S) > LONGEST_S:
+            raise BagError(f"an episode in {self.name} lasts {lasts_s / 3600:.0f} h: a clock was set while it was "
+                           "recorded; set timeline to the other clock, or leave this bag out")
+        return np.arange(span.start_ns, span.end_ns + 1, self.contract.period_ns, dtype=np.int64)
+
+    def _observations(self, ticks: Times) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """(K, V) the newest picture of each camera, and (K, S) the newest state."""
+        pictures = [stream.numbers[stream.newest(ticks)] for stream in self._images]
+        states = [stream.values[stream.newest(ticks)] for stream in self._state]
+        return np.stack(pictures, 1), np.concatenate([np.zeros((len(ticks), 0)), *states], 1)
+
+    def _seen(self, ticks: Times, commanded: BoolArray) -> BoolArray:
+        """(K,) whether every observed topic has a sample that is new enough; counts ticks without one, and gaps.
+
+        commanded: (K, topics), of _commands; after the last frame nothing is, and nothing is missing.
+        """
+        fresh = [self._is_fresh(stream, ticks) for stream in (*self._images, *self._state)]
         self.tally.ticks += len(ticks)
-        for stream in (*self._images, *self._state, *self._actions):
-            place, has = stream.place, self._is_fresh(stream, ticks)
-            if isinstance(stream.source, Commands):
-                has = self._command(stream, ticks)[1]
-                has[-1] = True  # nothing is commanded after the last frame
-            else:
-                seen &= has
+        streams = (*self._images, *self._state, *self._actions)
+        for stream, has in zip(streams, (*fresh, *commanded[:-1].T), strict=True):
+            place = stream.place
             self.tally.missing[place] += int((~has).sum())
             inside = stream.times[slice(*np.searchsorted(stream.times, ticks[[0, -1]]))]
             times = np.concatenate([ticks[:1], inside, ticks[-1:]])
@@ -197,7 +201,7 @@ class Planner:
             if gap_s > self.tally.gaps.get(place, (0.0, ""))[0]:
                 begins_s = (times[largest] + int(stream.offset_ms * 1e6) - self.begun_ns) / NS_PER_S
                 self.tally.gaps[place] = gap_s, f"{self.name} at {begins_s:.1f} s"
-        return seen
+        return np.asarray(np.logical_and.reduce(fresh))
 
     def _is_fresh(self, stream: Stream, ticks: Times) -> BoolArray:
         newest = stream.newest(ticks)
@@ -216,9 +220,9 @@ class Planner:
         return (stream.integral(ends) - stream.integral(begins)) / spent, has
 
     def _commands(self, ticks: Times) -> tuple[NDArray[np.float64], BoolArray]:
-        """(K, A) commands in their units, and (K,) whether there is one of every topic."""
+        """(K, A) commands in their units, and (K, topics) whether there is one of each topic."""
         parts = [self._command(stream, ticks) for stream in self._actions]
-        return np.concatenate([values for values, _ in parts], 1), np.logical_and.reduce([has for _, has in parts])
+        return np.concatenate([values for values, _ in parts], 1), np.stack([has for _, has in parts], 1)
 
     def _relative(self, commands: NDArray[np.float64], states: NDArray[np.float64]) -> NDArray[np.float64]:
         """(K, A) commands, those of joints' targets as changes."""

@@ -109,6 +109,8 @@ class Survey:
 def survey(paths: Sequence[Path], contract: Contract) -> Survey:
     """Read the numbers of all bags and plan their episodes; the numbers of one bag are in memory at a time.
 
+    A bag is opened to be checked, to be read, and to be written: of compressed ones one lies unpacked at a time.
+
     Raises:
         BagError: names what does not fit the contract, with the remedies.
     """

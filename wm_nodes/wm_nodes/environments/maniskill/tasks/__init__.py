@@ -1,6 +1,6 @@
 """The tasks in ManiSkill, one file each. To add a task, add a file; no other file changes.
 
-1. Write <name>.py, here or in a package of your own whose name is in the environment variable WM_TASKS (several are
+1. Write <name>.py, here, or anywhere with its path or its package in the environment variable WM_TASKS (several are
    separated by commas), for example `WM_TASKS=my_robot.tasks`. The file's name is the task's: the command lines and
    launch files offer it, and `unknown task` names it.
 2. In it, TASK = Task(...), whose fields are explained in config/tasks.py. Take push_cube.py as a pattern: a task on
