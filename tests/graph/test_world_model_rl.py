@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ from wm_nodes.training.run_lock import NAME
 from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_rl.execution_reward import EXECUTION_SCORES, load_execution_reward
 from wm_nodes.video_rl.recorded_buffers import RecordedClips, read_clips, rescore
 from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, ClipScores, load_probe
 from wm_nodes.video_rl.sampling import RecordedContexts
@@ -43,7 +45,7 @@ from wm_nodes.world_model.position_probe import PositionProbe
 
 pytestmark = pytest.mark.graph
 PROGRAM = "import sys; from wm_nodes.apps.cli import main; sys.exit(main(['train-video-model', *sys.argv[1:]]))"
-SETTINGS = {"grpo.ema_decay": 0.5, "rewards.closeness": 0.5}
+SETTINGS = {"grpo.ema_decay": 0.5, "rewards.closeness": 0.5, "rewards.execution": 0.5}
 ARGUMENTS = ["--preset", "smoke", *(f"--{name}={value}" for name, value in SETTINGS.items())]
 
 
@@ -131,7 +133,7 @@ def test_the_averaged_weights_are_measured_after_and_the_base_model_once_before(
 def test_every_metric_is_in_the_document_and_tensorboard_has_them_too(run_dir: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    scores = {*ClipScores.__dataclass_fields__, *PICTURE_SCORES}
+    scores = {*ClipScores.__dataclass_fields__, *PICTURE_SCORES, *EXECUTION_SCORES}
     assert [line["step"] for line in read_metrics(run_dir, "grpo")] == [1, 2]
     assert [line["step"] for line in read_metrics(run_dir, "heldout")] == [1, 2]
     for line in read_metrics(run_dir):
@@ -175,19 +177,24 @@ def test_recorded_clips_are_scored_again_to_the_same_bits(
     found = json.loads((run_dir / "rescored.json").read_text())
     assert found["equal"] and [row["iteration"] for row in found["buffers"]] == [0, 1]
     assert all(row["recorded"] == row["again"] for row in found["buffers"])
-    first, codec = recorded(run_dir)[0], load_video_folder(run_dir / "video_model").codec
-    assert first.weights["closeness"] == 0.5 and first.scores["closeness"].isfinite().all()
+    first, folder = recorded(run_dir)[0], load_video_folder(run_dir / "video_model")
+    for name in ("closeness", "execution"):
+        assert first.weights[name] == 0.5 and first.scores[name].isfinite().all() and first.scores[name].std() > 0
+    again = partial(
+        rescore, contexts=contexts, probe=probe, codec=folder.codec, rewards=config.rewards, num_conditioning=1,
+        execution=load_execution_reward(config, folder, contexts, probe),
+    )
     values = first.scores["tool_cm"].clone()
     values[3] = torch.nextafter(values[3], torch.tensor(torch.inf, dtype=torch.float64))
     changed = replace(first, scores={**first.scores, "tool_cm": values})
-    assert rescore(changed, contexts, probe, codec, config.rewards, 1).different == ("tool_cm",)
+    assert again(changed).different == ("tool_cm",)
     assert first.picture is not None
     dark = replace(first, picture=first.picture // 2)
-    assert {"psnr_db", "total"} <= set(rescore(dark, contexts, probe, codec, config.rewards, 1).different)
+    assert {"psnr_db", "execution", "total"} <= set(again(dark).different)
     with pytest.raises(BagError, match="picture of iteration 0 is not in the bag"):
-        rescore(replace(first, picture=None), contexts, probe, codec, config.rewards, 1)
+        again(replace(first, picture=None))
     with pytest.raises(BagError, match="beauty cannot be scored again"):
-        rescore(replace(first, scores={"beauty": values}), contexts, probe, codec, config.rewards, 1)
+        again(replace(first, scores={"beauty": values}))
 
 
 @pytest.mark.slow

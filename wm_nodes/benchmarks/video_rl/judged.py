@@ -60,7 +60,7 @@ class JudgedContexts(RecordedContexts):
         if reason := pause_reason(self.verdicts):
             raise TrainingPaused(reason)
         rewards = self.config.rewards
-        scores = all_scores(frames, references, self.probe, self.folder.codec, given, rewards)
+        scores = all_scores(frames, references, self.probe, self.folder.codec, given, rewards, self.execution)
         scores |= agent_scores(self.verdicts)
         return attach_rewards(clips, scores, mix_rewards(scores, rewards))
 

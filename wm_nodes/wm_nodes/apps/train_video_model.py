@@ -71,8 +71,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--reward", choices=REWARDS,
-        help="agent: a judge's verdict on each clip; reference: how well the clip follows its recording; closeness: "
-        "how alike both look, which needs no simulator state. Default: what the preset weighs",
+        help="agent: a judge's verdict on each clip; execution: whether the task gets done when the action world model "
+        "follows the clip's motion (with --preset outcome); reference: how well the clip follows its recording; "
+        "closeness: how alike both look, which needs no simulator state. Default: what the preset weighs",
     )
     options.add_judge(parser)
     options.add_tensorboard(parser)

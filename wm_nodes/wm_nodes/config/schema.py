@@ -24,6 +24,8 @@ from wm_nodes.config.tasks import check_task, instruction
 
 AGENT = "agent"
 """Name of the reward agent among the rewards of both loops."""
+EXECUTION = "execution"
+"""Name of the reward of clips by an action world model, see video_rl/execution_reward.py."""
 
 TaskName = Annotated[
     str, BeforeValidator(lambda name: name or ""), AfterValidator(lambda name: name and check_task(name))

@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from wm_nodes.config.judge import JudgeConfig
-from wm_nodes.config.schema import AGENT, DeviceName, TaskName
+from wm_nodes.config.schema import AGENT, EXECUTION, DeviceName, TaskName
 from wm_nodes.config.sections import (
     Fraction,
     NonNegativeFloat,
@@ -63,6 +63,13 @@ class VideoModelConfig(SettingsSection):
         if bool(self.training.given_frames) != bool(self.training.new_frames):
             raise ValueError("training.given_frames and new_frames go together; both are 0, or none")
         return self
+
+
+class ExecutionConfig(SettingsSection):
+    """The reward `execution`."""
+
+    model: str
+    """Folder of the world model whose action model follows the clips; empty: the shipped one of the task."""
 
 
 class GroupConfig(SettingsSection):
@@ -270,8 +277,10 @@ class VideoRlConfig(SettingsSection):
     others are refused."""
     rewards: dict[str, float]
     """Weight of each reward: a score against the recording (video_rl/reference_reward.py), of which `closeness`,
-    `ssim`, `perceptual`, `psnr_db`, `scenery` need no simulator state; or `agent`, which needs a judge. Several are
-    added, e.g. {outcome: 0.5, agent: 0.5}."""
+    `ssim`, `perceptual`, `psnr_db`, `scenery` need no simulator state; `agent`, which needs a judge; or `execution`,
+    by an action world model (video_rl/execution_reward.py). Several are added, e.g. {outcome: 0.5, agent: 0.5}."""
+    execution: ExecutionConfig
+    """Where `execution` is among the rewards."""
     judge: JudgeConfig
     """Where the agent is among the rewards."""
     model: VideoModelConfig
@@ -304,5 +313,10 @@ class VideoRlConfig(SettingsSection):
             raise ValueError(
                 "a judge sees whole episodes, and groups.history makes parts of them; set rewards.agent 0, or "
                 "groups.history 0"
+            )
+        if self.groups.history and self.rewards.get(EXECUTION):
+            raise ValueError(
+                "an action world model follows clips from a recorded first frame, and groups.history begins them with "
+                "frames that were made; set rewards.execution 0, or groups.history 0"
             )
         return self

@@ -1,5 +1,5 @@
 """reward_evaluator of loop 2: judges the clips of a rollout buffer against the recordings of their contexts, and by the
-reward agent where its verdict is among the weighed rewards."""
+reward agent or an action world model where they are among the weighed rewards."""
 
 import hashlib
 import sys
@@ -33,6 +33,7 @@ from wm_nodes.ros.worker import Work
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_rl.execution_reward import load_execution_reward
 from wm_nodes.video_rl.reference_reward import all_scores, load_probe, mix_rewards
 from wm_nodes.video_rl.sampling import ClipGenerator
 
@@ -62,6 +63,7 @@ class ClipEvaluatorNode(ManagedNode):
         contexts = load_clips(bags, folder.clip["stride"], self._config.clip_steps)
         self._generator = ClipGenerator(folder, contexts, self._config)
         self._probe = load_probe(Path(str(self.param("model_dir"))), device)
+        self._execution = load_execution_reward(self._config, folder, contexts, self._probe)
         self._fps = clip_fps(bags[0], folder.clip["stride"])
         self._files = named_files(self)
         self._agent = None
@@ -117,7 +119,7 @@ class ClipEvaluatorNode(ManagedNode):
         request = self._generator.request(buffer.iteration, buffer.policy_version)
         scores = all_scores(
             frames, self._generator.references(request), self._probe, self._generator.folder.codec,
-            buffer.condition.num_conditioning, self._config.rewards,
+            buffer.condition.num_conditioning, self._config.rewards, self._execution,
         )
         if self._agent is not None:
             scores |= agent_scores(verdicts)

@@ -15,6 +15,7 @@ TITLES = {
     "tracking": "tracking score", "object_cm": "object error, cm", "tool_cm": "tool error, cm", "psnr_db": "PSNR, dB",
     "scenery": "scenery error", "motion": "motion share", "success": "task done at the end", "outcome": "outcome score",
     "ssim": "SSIM", "perceptual": "perceptual score", "closeness": "closeness of pictures",
+    "execution": "done signal of the action world model", "execution_success": "task done in the action world model",
 }
 """Score to its name for people, in the order of the tables; see docs/metrics.md."""
 UNREWARDED_TITLES = {

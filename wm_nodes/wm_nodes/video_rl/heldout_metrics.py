@@ -23,6 +23,7 @@ from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_model.success_reader import SuccessReader
 from wm_nodes.video_model.tokenizer_codec import Codec
 from wm_nodes.video_rl.clip_faults import FaultLimits, FilmedScene, find_faults, measure_fault_limits
+from wm_nodes.video_rl.execution_reward import fit_tool_correction
 from wm_nodes.video_rl.reference_reward import score_clips
 from wm_nodes.video_rl.sampling import ClipGenerator
 from wm_nodes.video_rl.validation import evaluated_contexts
@@ -152,22 +153,6 @@ def measure_clips(
     probability = by.reader.read(frames[:, -1])
     read = {"reader_success": probability >= by.reader.threshold, "reader_probability": probability}
     return {**scores, **faults, **{name: torch.from_numpy(value.astype(np.float64)) for name, value in read.items()}}
-
-
-def fit_tool_correction(positions: FloatArray, truth: FloatArray) -> NDArray[np.float64]:
-    """Return the least-squares map (4, 3) from tool positions that the probe reads in decoded recordings to the true
-    ones, both (N, F, 3), with an offset in the last row. Raises ValueError where no true one is known.
-
-    A codec may make the tool look lower than it is: a shipped one does, by 1.1 cm on average and by
-    2.3 cm at heights above 12 cm. Uncorrected, paths that pass over the object touch it when they are executed.
-    """
-    seen, wanted = (values.reshape(-1, 3).astype(np.float64) for values in (positions, truth))
-    known = np.isfinite(wanted).all(1)
-    if not known.any():
-        raise ValueError("the recordings have no simulator state")
-    seen = np.column_stack([seen[known], np.ones(known.sum())])
-    found: NDArray[np.float64] = np.linalg.lstsq(seen, wanted[known], rcond=None)[0]
-    return found
 
 
 def measure_executability(

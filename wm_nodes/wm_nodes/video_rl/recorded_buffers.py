@@ -26,6 +26,7 @@ from wm_nodes.recording.raw import PARTIAL_SUFFIX
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.tokenizer_codec import Codec
+from wm_nodes.video_rl.execution_reward import EXECUTION_SCORES, ExecutionReward
 from wm_nodes.video_rl.reference_reward import all_scores, attach_rewards, mix_rewards
 from wm_nodes.world_model.position_probe import PositionProbe
 
@@ -175,6 +176,7 @@ def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
 def rescore(
     recorded: RecordedClips, contexts: Clips, probe: PositionProbe, codec: Codec, rewards: Mapping[str, float],
     num_conditioning: int, judge: BufferJudge | None = None, first: int = 0,
+    execution: ExecutionReward | None = None,
 ) -> Rescored:
     """Score the pictures against the recordings of their contexts and compare with the recorded scores, bit for bit.
 
@@ -183,6 +185,7 @@ def rescore(
         rewards: weights of the total; where other scores have a weight than were recorded, the total is not compared.
         judge: called where the agent is among the rewards.
         first: frame of the recordings that the clips begin with.
+        execution: of the same contexts, where it is among the rewards.
 
     Raises:
         BagError: no picture, or scores that cannot be computed from pictures.
@@ -195,8 +198,11 @@ def rescore(
         )
     references = contexts.select(recorded.contexts).window(first, recorded.num_frames)
     frames = recorded.frames(*references.frames.shape[2:4]).to(device_of(probe))
-    scores = all_scores(frames, references, probe, codec, num_conditioning, {*recorded.scores, *rewards})
-    unknown, verdicts = sorted(set(recorded.scores) - set(scores) - {AGENT}), tuple[Mapping[str, Any], ...]()
+    scores = all_scores(
+        frames, references, probe, codec, num_conditioning, {*recorded.scores, *rewards}, execution
+    )
+    asked = {AGENT, *EXECUTION_SCORES}  # given only where they are among the rewards
+    unknown, verdicts = sorted(set(recorded.scores) - set(scores) - asked), tuple[Mapping[str, Any], ...]()
     if judge is not None and rewards.get(AGENT):
         verdict = judge(recorded, frames, references)
         verdicts = verdict.verdicts

@@ -20,6 +20,7 @@ from wm_nodes.video_model import (
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.continuation import ClipLengths, clip_condition, continue_videos
 from wm_nodes.video_model.folder import VideoFolder
+from wm_nodes.video_rl.execution_reward import load_execution_reward
 from wm_nodes.video_rl.reference_reward import all_scores, attach_rewards, mix_rewards
 from wm_nodes.world_model.position_probe import PositionProbe
 
@@ -223,18 +224,23 @@ class RecordedContexts(ClipGenerator):
 
     Args:
         probe: reads positions off the clips.
+
+    Raises:
+        ValueError: as ClipGenerator, or load_execution_reward.
     """
 
     def __init__(self, folder: VideoFolder, contexts: Clips, config: VideoRlConfig, probe: PositionProbe) -> None:
         super().__init__(folder, contexts, config)
-        self.probe = probe
+        self.probe, self.execution = probe, load_execution_reward(config, folder, contexts, probe)
 
     def score(self, request: GroupRequest, clips: RolloutBuffer) -> RolloutBuffer:
         """Return the buffer with every score of its clips and the training reward `total`, mixed by config.rewards."""
         frames = self.folder.codec.decode(clips.rollout.latents)
         given = clips.condition.num_conditioning
         rewards = self.config.rewards
-        scores = all_scores(frames, self.references(request), self.probe, self.folder.codec, given, rewards)
+        scores = all_scores(
+            frames, self.references(request), self.probe, self.folder.codec, given, rewards, self.execution
+        )
         return attach_rewards(clips, scores, mix_rewards(scores, rewards))
 
 

@@ -17,6 +17,7 @@ from wm_nodes.core.model_folder import AGAIN, read_json
 from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder
+from wm_nodes.video_rl.execution_reward import EXECUTION_SCORES, load_execution_reward
 from wm_nodes.video_rl.reference_reward import (
     PICTURE_SCORES,
     ClipScores,
@@ -32,7 +33,7 @@ from wm_nodes.world_model.position_probe import PositionProbe
 SECTION = "heldout"
 """Of metrics.jsonl: scores by name, mean over the contexts, at the number of buffers trained on."""
 WATCHED = (*ClipScores.__dataclass_fields__, *PICTURE_SCORES)
-OUTCOMES = ("success", "outcome")
+OUTCOMES = ("success", "outcome", *EXECUTION_SCORES)
 
 HeldoutScores = Callable[[], Mapping[str, float]]
 """The held-out scores of a network's weights at the moment of the call."""
@@ -48,8 +49,11 @@ def context_scores(
     contexts = evaluated_contexts(heldout, config)
     folder.network.eval()
     frames = ClipGenerator(folder, contexts, config).evaluate(contexts, config.evaluation.num_steps)
-    scores = all_scores(frames, contexts, probe, folder.codec, folder.clip["num_conditioning"], config.rewards)
-    return {name: scores[name] for name in OUTCOMES} if config.groups.hide_actions else scores
+    scores = all_scores(
+        frames, contexts, probe, folder.codec, folder.clip["num_conditioning"], config.rewards,
+        load_execution_reward(config, folder, contexts, probe),
+    )
+    return {name: scores[name] for name in OUTCOMES if name in scores} if config.groups.hide_actions else scores
 
 
 def evaluated_contexts(heldout: Clips, config: VideoRlConfig) -> Clips:
