@@ -192,7 +192,7 @@ def paid_trials(sampler: SamplerSetup, plan: OutcomePlan) -> list[SamplerTrial[O
     """
     rewards: dict[str, tuple[tuple[str, float], ...]] = {
         f"judge {plan.rubric}": ((AGENT, 1.0),), EXECUTION: ((EXECUTION, 1.0),),
-        f"{EXECUTION} + outcome": ((EXECUTION, 1.0), ("outcome", 0.3)),
+        f"{EXECUTION} and outcome": ((EXECUTION, 1.0), ("outcome", 0.3)),
     }
     return [
         SamplerTrial(replace(sampler, name=f"{sampler.name}, {name}"), replace(plan, rewards=weights))
