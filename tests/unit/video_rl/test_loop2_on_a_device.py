@@ -6,6 +6,7 @@ A forgotten move between the CPU and the device, in any of these paths, is refus
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,9 +24,11 @@ from video_toys import ACTION_DIM, tiny_network, toy_buffer, toy_rollout_setting
 from benchmarks.video_rl.cost import toy_rollout
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_video_config
+from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import DeviceError, device_of
 from wm_nodes.core.seeding import torch_stream
+from wm_nodes.core.specs import spec_of_values
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.judge.service import buffer_jobs
 from wm_nodes.nodes.video_model_node import film_strip
@@ -34,6 +37,7 @@ from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.flow_matching import train_video_model
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_model.tokenizer_codec import codec_of_world_model
+from wm_nodes.video_rl.execution_reward import load_execution_reward
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.pretraining import make_video_model
 from wm_nodes.video_rl.sampling import RecordedContexts
@@ -41,6 +45,7 @@ from wm_nodes.video_rl.toy_scene import NETWORK, ToyContexts, draw_scenes, load_
 from wm_nodes.video_rl.train import post_train, sample_buffers
 from wm_nodes.video_rl.training_run import VideoRun, progress
 from wm_nodes.video_rl.validation import context_scores
+from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.position_probe import PositionProbe
 
 TOY = {
@@ -298,3 +303,20 @@ def test_too_little_memory_for_clips_or_for_an_update_names_what_to_lower_and_ch
     run.close()
     assert all(torch.equal(weights_of(source.network)[name], weight) for name, weight in before.items())
     assert (run.version, run.iterations) == (0, 0)
+
+
+def test_an_action_world_model_pays_clips_where_the_video_model_is(device: Device) -> None:
+    world = shipped_model("push_cube")
+    shown, recordings = clips(3, 0, 64, 128), clips(4, 1, 64, 128)
+    states = recordings.ground_truth[..., 4:7] + np.float32([0.6, 0, 0])
+    spec = spec_of_values(read_world_manifest(world)["spec"])
+    recordings = replace(recordings, states=states, spec=spec)
+
+    def work(where: str) -> Found:
+        config = small_config(where, rewards={"execution": 1.0})
+        folder = load_video_folder(world / "video_model_outcome", where)
+        reward = load_execution_reward(config, folder, recordings, probe_on(where, 64, 128))
+        assert reward is not None and device_of(folder.network).type == where
+        return reward.score(shown.frames.to(where), recordings.select(torch.arange(3)))
+
+    check_both(device, work)
