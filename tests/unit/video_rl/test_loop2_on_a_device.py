@@ -54,8 +54,7 @@ SMALL = {
 }
 """The preset gpu at a size for tests."""
 NFT = {
-    "grpo.objective": "nft", "grpo.kl.mode": "velocity", "grpo.kl.anchor": "frozen", "grpo.nft.old_decay": 0.5,
-    "grpo.nft.old_ramp": 1.0,
+    "grpo.objective": "nft", "grpo.kl.anchor": "frozen", "grpo.nft.old_decay": 0.5, "grpo.nft.old_ramp": 1.0,
 }
 Found = dict[str, Tensor]
 
@@ -105,12 +104,12 @@ def test_flow_matching_learns_the_same_weights_and_goes_on_from_a_checkpoint(dev
 @pytest.mark.parametrize(
     "changes",
     [
-        {"grpo.kl.anchor": "dual", "grpo.kl.dual_every": 1, "grpo.ema_decay": 0.9},
+        {"grpo.kl.anchor": "dual", "grpo.kl.dual_every": 1},
         {"rollout.buffer_device": "cpu", "grpo.kl.anchor": "frozen", "rollout.storage_dtype": "bfloat16"},
-        {"rollout.sampler.arm": "flow", "rollout.cfg": 2.0, "grpo.cfg": 2.0},
-        {"rollout.noise_store": "zeta_bfloat16", "rollout.sampler.arm": "sage", "rollout.buffer_device": "cpu"},
+        {"rollout.sampler.arm": "flow", "rollout.cfg": 2.0},
+        {"rollout.sampler.arm": "sage", "rollout.buffer_device": "cpu"},
         {**NFT, "rollout.sampler.arm": "ode"},
-        {**NFT, "rollout.buffer_device": "cpu", "grpo.kl.mode": "none"},
+        {**NFT, "rollout.buffer_device": "cpu", "grpo.kl.beta": 0.0},
     ],
     ids=["dual", "host", "flow", "sage", "nft", "nft, host"],
 )
@@ -133,10 +132,10 @@ def test_the_toy_is_sampled_scored_trained_saved_and_evaluated_alike(
                 found[f"buffer {iteration}"] = as_bytes(buffer.to_bytes())
             numbers = [value for update in report.updates for value in list(vars(update).values())[:7]]
             found[f"report {iteration}"] = torch.tensor([*numbers, report.reward_mean, report.noise_share])
-            learner.save(path, iteration=iteration + 1)
+            learner.save(path)
         again = learner_of(ToyContexts(load_base(device=where), config))
-        assert again.load(path) == 2
-        found |= {f"averaged {name}": value.cpu().clone() for name, value in again.averaged.items()}
+        again.load(path)
+        assert again.iterations == 2
         found |= {name: value.cpu() for name, value in source.evaluate(draw_scenes(3, 0, "evaluation")).named().items()}
         following = [source.score(request, source.sample(request)) for request in [source.request(2, learner.version)]]
         for one in (learner, again):

@@ -15,7 +15,7 @@ from torch.nn.utils import clip_grad_norm_
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import GrpoConfig, RolloutConfig
 from wm_nodes.core.device import device_of
-from wm_nodes.video_model import RolloutBuffer, VideoNetwork, VideoRollout, config_hash, flow_times
+from wm_nodes.video_model import RolloutBuffer, VideoNetwork, VideoRollout, config_hash
 from wm_nodes.video_model.flow_matching import flow_matching_loss
 from wm_nodes.video_rl.grpo import BufferReport, UpdateReport, mixed_reward
 from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
@@ -30,7 +30,7 @@ class FlowMatchingLearner:
     """Trains `model` in place by flow matching on clips of a buffer; the interface is that of GrpoLearner.
 
     Args:
-        settings: learning_rate, weight_decay, max_grad_norm, updates_per_buffer, max_staleness are used.
+        settings: learning_rate, weight_decay, max_grad_norm, updates_per_buffer are used.
         keep: all valid clips, or of each group the one of highest reward.
         draws: (time, noise) pairs per kept clip and buffer, spread over the updates; a multiple of updates_per_buffer.
         seed: of times and noise (stream `flow_matching`).
@@ -42,7 +42,7 @@ class FlowMatchingLearner:
         if draws % settings.updates_per_buffer:
             raise ValueError(f"{draws} draws cannot be spread over {settings.updates_per_buffer} updates evenly")
         self.model, self.settings, self.rollout, self.seed, self.keep = model, settings, rollout, seed, keep
-        self.draws, self.version = draws, 0
+        self.draws, self.version, self.iterations = draws, 0, 0
         self._flow = load_video_config("base").model.training.with_values(drop=0.0)
         self.parameters = [p for p in model.parameters() if p.requires_grad]
         self._optimizer = torch.optim.AdamW(
@@ -53,12 +53,13 @@ class FlowMatchingLearner:
         """Make updates_per_buffer optimizer steps.
 
         Raises:
-            RolloutBufferError: another sampler configuration, or a stale buffer.
+            RolloutBufferError: another sampler configuration, or other weights.
             FloatingPointError: a gradient is not finite.
         """
-        buffer.check(self.rollout, self.version, self.settings.max_staleness)
+        buffer.check(self.rollout, self.version)
         rows = torch.nonzero(kept_clips(buffer, self.keep))[:, 0]
         updates = tuple(self._update(buffer, rows) for _ in range(self.settings.updates_per_buffer))
+        self.iterations += 1
         rewards = mixed_reward(buffer)
         groups = len(set(buffer.group_ids.tolist()))
         return BufferReport(
@@ -117,8 +118,7 @@ class RecordedTargets(RecordedContexts):
         settings, N = self.config.rollout, len(latents)
         none = latents.new_zeros(N, 0, *latents.shape[1:])
         rollout = VideoRollout(
-            latents, (), (), none, none[:, :, :1], latents.new_zeros(N, 0), none, torch.zeros(N, dtype=torch.int64),
-            latents.new_zeros(0), flow_times(settings.num_steps, settings.shift),
+            latents, (), none, none[:, :, :1], none, torch.zeros(N, dtype=torch.int64), latents.new_zeros(0),
         )
         rows = torch.arange(N)
         return RolloutBuffer(

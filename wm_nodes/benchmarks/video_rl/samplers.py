@@ -15,7 +15,7 @@ LEARNER = BASE.grpo.with_values(learning_rate=1e-4, micro_batch=64)
 """Table 5's clip, advantage clip, KL and step fraction; a learning rate for 76 k parameters instead of billions."""
 CLIP_LEARNER = BASE.grpo.with_values(
     advantage=BASE.grpo.advantage.with_values(std_scope="global", best_of_n=4),
-    kl=BASE.grpo.kl.with_values(mode="none"), trains="condition", logprob_weight="cps", updates_per_buffer=1,
+    kl=BASE.grpo.kl.with_values(beta=0.0), trains="condition", logprob_weight="cps", updates_per_buffer=1,
     step_fraction=1.0, learning_rate=2e-4, weight_decay=0.0,
 )
 """The setting in which the shipped video model was seen to learn from recorded contexts that it was not trained on:
@@ -112,7 +112,7 @@ def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
     others' four steps do, a call with its gradient counted as three.
     """
     nft = learner.with_values(
-        objective="nft", nft=learner.nft.with_values(times=3), kl=learner.kl.with_values(mode="none"),
+        objective="nft", nft=learner.nft.with_values(times=3), kl=learner.kl.with_values(beta=0.0),
         learning_rate=NFT_RATE,
     )
     cps = learner.with_values(logprob_weight="cps")

@@ -36,7 +36,7 @@ from wm_nodes.video_rl.heldout_metrics import load_or_measure_unrewarded, make_y
 from wm_nodes.video_rl.pretraining import BEFORE
 from wm_nodes.video_rl.reference_reward import more_is_better
 from wm_nodes.video_rl.sampling import ClipGenerator
-from wm_nodes.video_rl.training_run import evaluated_uri
+from wm_nodes.video_rl.training_run import VIDEO_FILES
 from wm_nodes.video_rl.validation import SECTION, WATCHED, alarm_text, alarms_of, load_or_measure_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
@@ -55,9 +55,8 @@ def conclude(
         OSError: the version's weights are gone.
     """
     base_folder, trained = (load_video_folder(base, compute_device(config.device)) for _ in range(2))
-    uri = evaluated_uri(version, config)
     if version:
-        load_weights_file(trained.network, run_dir / uri)
+        load_weights_file(trained.network, run_dir / VIDEO_FILES.uri(version))
     before = load_or_measure_scores(run_dir / BEFORE, base_folder, heldout, probe, config)
     after = load_or_measure_scores(run_dir / AFTER, trained, heldout, probe, config)
     device, shipped = compute_device(config.device), shipped_model(config.task)
@@ -71,7 +70,7 @@ def conclude(
     watched = [line for line in lines if line.get("hacked") is not None]
     summary = as_first_made(run_dir, ClipSummary(
         task=config.task, preset=preset, seed=config.seed, iterations=iterations, version=version,
-        weights="averaged" if config.grpo.ema_decay > 0 else "last", contexts=len(before["success"]),
+        contexts=len(before["success"]),
         scores={
             name: score_change(name, before[name], after[name], config.seed) for name in TITLES if name in before
         },

@@ -156,7 +156,7 @@ def _measure_memory(learner: GrpoLearner, sampled: VideoRollout, videos: int) ->
 
 def _limits(rollout: RolloutConfig) -> tuple[float, float]:
     """Return the limits of the ratio's distance from 1, and of the KL."""
-    if rollout.noise_store == "zeta_bfloat16":
+    if rollout.storage_dtype == "bfloat16":
         return ROUNDED_RATIO_LIMIT, ROUNDED_KL_LIMIT
     return RATIO_LIMIT, KL_LIMIT
 
@@ -164,12 +164,10 @@ def _limits(rollout: RolloutConfig) -> tuple[float, float]:
 def _without_updates(grpo: GrpoConfig, rollout: RolloutConfig) -> GrpoConfig:
     """Settings of one update that changes no weight; a transition beyond the ratio's limit counts as clipped."""
     limit, _ = _limits(rollout)
-    mode, anchor = "mean", grpo.kl.anchor
-    if grpo.objective == "nft":
-        mode, anchor = "velocity", "lora_off" if anchor == "lora_off" else "frozen"
+    anchor = "frozen" if grpo.objective == "nft" and grpo.kl.anchor != "lora_off" else grpo.kl.anchor
     return grpo.with_values(
-        updates_per_buffer=1, learning_rate=0.0, weight_decay=0.0, ema_decay=0.0,
-        kl=grpo.kl.with_values(mode=mode, beta=1.0, anchor=anchor), clip_low=limit, clip_high=limit,
+        updates_per_buffer=1, learning_rate=0.0, weight_decay=0.0, clip=limit,
+        kl=grpo.kl.with_values(mode="mean", beta=1.0, anchor=anchor),
         advantage=load_video_config("base").grpo.advantage,
     )
 
@@ -183,8 +181,8 @@ def _check_first_update(learner: GrpoLearner, buffer: RolloutBuffer) -> tuple[Ch
         "ratio is 1 on the first update", not has_ratio or (error < ratio_limit and outside == 0),
         f"mean ratio differs from 1 by {error:.1e}, {outside:.0%} of the transitions by more than {ratio_limit:g}"
         if has_ratio else "objective nft has none",
-        "make rollout and training pass alike: rollout.cfg and grpo.cfg, dtype, micro_batch, dropout off, attention "
-        "kernels; noise_store zeta",
+        "make rollout and training pass alike: dtype, micro_batch, dropout off, attention kernels; storage_dtype "
+        "float32",
     ), CheckResult(
         "KL is 0 at the anchor", update.kl < kl_limit, f"{update.kl:.1e} to {learner.settings.kl.anchor}",
         "as for the ratio",

@@ -1,5 +1,5 @@
 """RL of a flow-matching video model on a rollout buffer: GRPO (DD-13 to DD-18, DD-20), or with grpo.objective nft
-DiffusionNFT (DD-31); averaged weights: DD-30.
+DiffusionNFT (DD-31).
 
 Shapes: N videos, S stochastic steps, M transitions (video, step) of one network call, U generated elements.
 
@@ -15,7 +15,6 @@ import json
 import math
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -121,6 +120,8 @@ class GrpoLearner:
         self.ranks = ranks or Ranks()
         self.version = 0
         """Optimizer steps made so far: the policy version of the weights."""
+        self.iterations = 0
+        """Buffers trained on so far, those that were skipped among them."""
         self.skipped = 0
         """Buffers in a row, up to now, that no optimizer step was made on."""
         self.parameters = [p for p in model.parameters() if p.requires_grad]
@@ -128,7 +129,6 @@ class GrpoLearner:
             self.parameters, lr=settings.learning_rate, weight_decay=settings.weight_decay
         )
         self._terms = (NftTerms if settings.objective == "nft" else GrpoTerms)(model, settings, rollout, seed)
-        self.averaged = self._terms.trained() if settings.ema_decay > 0 else {}
 
     def train(self, buffer: RolloutBuffer) -> BufferReport:
         """Make `updates_per_buffer` optimizer steps; nothing has changed when it raises.
@@ -136,12 +136,12 @@ class GrpoLearner:
         A buffer whose rewards differ in no group is skipped: its report has no updates, the weights stay.
 
         Raises:
-            RolloutBufferError: another sampler configuration, or a stale buffer.
+            RolloutBufferError: another sampler configuration, or other weights.
             ValueError: a reward that is marked valid and not finite, no group with enough valid ones, MAX_SKIPPED
                 buffers in a row without spread, or no generated frame.
             FloatingPointError: a loss or gradient is not finite.
         """
-        buffer.check(self.rollout, self.version, self.settings.max_staleness)
+        buffer.check(self.rollout, self.version)
         if buffer.condition.num_conditioning >= buffer.rollout.latents.shape[2]:
             raise ValueError(
                 f"all {buffer.rollout.latents.shape[2]} frames of these videos are given: nothing was generated that "
@@ -173,6 +173,7 @@ class GrpoLearner:
             self._restore(before)
             raise
         self.skipped = skipped
+        self.iterations += 1
         return BufferReport(
             updates=updates,
             reward_mean=float(rewards[buffer.valid].mean()),
@@ -219,10 +220,6 @@ class GrpoLearner:
         self.ranks.sum_(values)
         return dict(zip(SUMS, values.tolist(), strict=True))
 
-    def averaged_weights(self) -> AbstractContextManager[None]:
-        """Return a context in which the model has its averaged weights, for evaluation; without EMA, its own."""
-        return _swap_weights(self.model, self.averaged) if self.averaged else nullcontext()
-
     # internals
 
     @staticmethod
@@ -242,10 +239,6 @@ class GrpoLearner:
             )
         self._optimizer.step()
         self.version += 1
-        decay = min(self.settings.ema_decay, (1 + self.version) / (10 + self.version))
-        for name, parameter in _trained_parameters(self.model):
-            if name in self.averaged:
-                self.averaged[name].lerp_(parameter.detach(), 1 - decay)
         total = len(rows.videos)
         return UpdateReport(
             objective=sums["objective"] / total, kl=sums["kl"] / total, ratio_mean=sums["ratio"] / total,
@@ -256,11 +249,10 @@ class GrpoLearner:
 
     def _snapshot(self) -> dict[str, Any]:
         """Copy what a failed train() puts back, where it is: on a GPU that is once more the memory of the weights that
-        train, of their two moments and of their average, and nothing crosses to the host."""
+        train and of their two moments, and nothing crosses to the host."""
         return {
             "model": self._terms.trained(),
             "optimizer": {k: v.detach().clone() for k, v in checkpoint.optimizer_tensors(self._optimizer).items()},
-            "averaged": {name: value.clone() for name, value in self.averaged.items()},
             "old": self._terms.old,  # replaced, never changed
             "version": self.version,
         }
@@ -268,27 +260,27 @@ class GrpoLearner:
     def _restore(self, before: dict[str, Any]) -> None:
         _set_trained(self.model, before["model"])
         checkpoint.restore_optimizer(self._optimizer, before["optimizer"])
-        for name, value in before["averaged"].items():
-            self.averaged[name].copy_(value)
         self._terms.old, self.version = before["old"], before["version"]
 
     # checkpoints
 
-    def save(self, path: Path, *, iteration: int) -> None:
-        """Write everything that train() depends on, atomically: trained, averaged, anchor's and old weights, optimizer,
-        counters."""
+    def save(self, path: Path) -> None:
+        """Write everything that train() depends on, atomically: trained, anchor's and old weights, optimizer, counters.
+        """
         sections = {
-            "model": dict(_trained_parameters(self.model)), "averaged": self.averaged, "anchor": self._terms.anchor,
-            "old": self._terms.old, "optimizer": checkpoint.optimizer_tensors(self._optimizer),
+            "model": dict(_trained_parameters(self.model)), "anchor": self._terms.anchor, "old": self._terms.old,
+            "optimizer": checkpoint.optimizer_tensors(self._optimizer),
         }
-        header = {"version": self.version, "seed": self.seed, "iteration": iteration, "skipped": self.skipped}
+        header = {
+            "version": self.version, "seed": self.seed, "iteration": self.iterations, "skipped": self.skipped
+        }
         checkpoint.write_checkpoint(path, sections, {"grpo": json.dumps(header)})
 
-    def load(self, path: Path) -> int:
-        """Continue exactly from save(); return its iteration.
+    def load(self, path: Path) -> None:
+        """Continue exactly from save().
 
         Raises:
-            ValueError: the file is damaged, or of another architecture, seed, objective, KL anchor or EMA.
+            ValueError: the file is damaged, or of another architecture, seed, objective or KL anchor.
         """
         try:
             tensors, metadata = checkpoint.read_checkpoint(path)
@@ -299,21 +291,17 @@ class GrpoLearner:
             raise ValueError(f"{path} has seed {header['seed']}, this run has {self.seed}; use a new run folder")
         weights = checkpoint.section(tensors, "model.")
         check_same_layout(dict(_trained_parameters(self.model)), weights, what=str(path))
-        own = {
-            "averaged.": (self.averaged, "ema_decay"), "anchor.": (self._terms.anchor, "kl.anchor"),
-            "old.": (self._terms.old, "objective"),
-        }
+        own = {"anchor.": (self._terms.anchor, "kl.anchor"), "old.": (self._terms.old, "objective")}
         for prefix, (values, setting) in own.items():
             if bool(values) != bool(checkpoint.section(tensors, prefix)):
                 raise ValueError(f"{path} was made with another grpo.{setting}; resume with its settings")
         _set_trained(self.model, weights)
         device = device_of(self.model)
-        self.averaged, self._terms.anchor, self._terms.old = (
+        self._terms.anchor, self._terms.old = (
             {name: value.to(device) for name, value in checkpoint.section(tensors, prefix).items()} for prefix in own
         )
         checkpoint.restore_optimizer(self._optimizer, checkpoint.section(tensors, "optimizer."))
-        self.version, self.skipped = header["version"], header["skipped"]
-        return int(header["iteration"])
+        self.version, self.iterations, self.skipped = header["version"], header["iteration"], header["skipped"]
 
 
 def _train_condition(model: nn.Module) -> None:
@@ -335,17 +323,6 @@ def mixed_reward(buffer: RolloutBuffer) -> Tensor:
     if len(buffer.rewards) == 1:
         return next(iter(buffer.rewards.values()))
     raise ValueError(f"the buffer holds rewards {', '.join(buffer.rewards) or '(none)'} and no `total`; mix them first")
-
-
-@contextmanager
-def _swap_weights(model: nn.Module, values: dict[str, Tensor]) -> Iterator[None]:
-    """Give the trained parameters other values within the context."""
-    own = {name: p.detach().clone() for name, p in _trained_parameters(model)}
-    _set_trained(model, values)
-    try:
-        yield
-    finally:
-        _set_trained(model, own)
 
 
 def _trained_parameters(model: nn.Module) -> Iterator[tuple[str, Tensor]]:

@@ -4,8 +4,8 @@ from any sampler.
 Shapes: M rows (video, forward time) of one network call, U generated elements.
 
 v_old is the velocity of the old weights, a copy of the parameters that train. With nft.old_decay 0 it is theirs at the
-buffer's first update: unless the buffer is stale, those that sampled it. With nft.old_decay > 0 it lags behind, while
-the current weights go on sampling; the authors let the old ones sample.
+buffer's first update: those that sampled it. With nft.old_decay > 0 it lags behind, while the current weights go on
+sampling; the authors let the old ones sample.
 
 Times are those of the sampler in density: uniform, one in each of nft.times equal parts of (0, 1), then shifted by
 rollout.shift. Theirs are the sampler's own times, all of them, each with a noise of its own.
@@ -88,7 +88,7 @@ class NftTerms(Anchored):
 
     def kl(self, current: ForwardPass, buffer: RolloutBuffer, rows: Rows, version: int) -> Tensor:
         """Return mean over elements of |v - v_anchor|^2 (DD-17a), (M,); 0 without an anchor."""
-        if not self._has_kl:
+        if not self.settings.kl.beta:
             return torch.zeros_like(current.objective)
         with torch.no_grad(), self.anchored() as model:
             anchor = self._velocity(model, current.x_t, current.t, current.condition)
@@ -97,18 +97,14 @@ class NftTerms(Anchored):
     def sums(self, current: ForwardPass, kl: Tensor) -> Tensor:
         """Return the sum of kl, NaN without an anchor, and NaN for ratio and clips, float64 (4,)."""
         missing = kl.new_full((4,), torch.nan, dtype=torch.float64)
-        if self._has_kl:
+        if self.settings.kl.beta:
             missing[0] = kl.detach().sum()
         return missing
 
     # internals
 
-    @property
-    def _has_kl(self) -> bool:
-        return self.settings.kl.mode != "none" and self.settings.kl.beta > 0
-
     def _velocity(self, model: Any, x: Tensor, t: Tensor, condition: Condition) -> Tensor:
-        v = guided_velocity(model, x, t, condition, self.settings.cfg).float()
+        v = guided_velocity(model, x, t, condition, self.rollout.cfg).float()
         return v[:, :, condition.num_conditioning :].flatten(1)
 
     def _call_old(self, *arguments: Any) -> Any:

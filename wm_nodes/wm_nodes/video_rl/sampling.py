@@ -74,7 +74,7 @@ def sample_buffer(
     RolloutBuffer.
     """
     settings = config.rollout
-    steps = stochastic_steps(settings.num_steps, config.window, iteration, config.seed)
+    steps = stochastic_steps(settings.num_steps, config.window, iteration)
     device = device_of(network)
     condition = condition.to(device)
     with explain_memory(device, rollout__micro_batch=settings.micro_batch, groups__contexts=config.groups.contexts):

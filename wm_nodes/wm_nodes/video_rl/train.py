@@ -28,6 +28,8 @@ class VideoLearner(Protocol):
 
     @property
     def version(self) -> int: ...
+    @property
+    def iterations(self) -> int: ...
     def train(self, buffer: RolloutBuffer) -> BufferReport: ...
 
 
@@ -37,10 +39,10 @@ def post_train(learner: VideoLearner, buffers: Iterable[RolloutBuffer]) -> Itera
         yield buffer, learner.train(buffer)  # learner.version is new from here on
 
 
-def sample_buffers(source: ClipSource[Request], learner: VideoLearner, iterations: int) -> Iterator[RolloutBuffer]:
+def sample_buffers(source: ClipSource[Request], learner: VideoLearner, count: int) -> Iterator[RolloutBuffer]:
     """Buffers of fresh clips with their rewards, each sampled when it is asked for."""
-    for iteration in range(iterations):
-        request = source.request(iteration, learner.version)  # which contexts, and which weights sample
+    for _ in range(count):
+        request = source.request(learner.iterations, learner.version)  # which contexts, and which weights sample
         clips = source.sample(request)  # a group of clips of each context
         yield source.score(request, clips)  # a clip without reward is left out
 
