@@ -20,7 +20,8 @@ from benchmarks.video_rl.comparison import GAINS, compare_samplers, gains, paire
 from benchmarks.video_rl.cost import ANCHORS, toy_rollout
 from benchmarks.video_rl.learning import alarms, hacked, train_on_discs
 from benchmarks.video_rl.samplers import LEARNER, DiscPlan, SamplerSetup, dyndiff, learning_samplers, sampler_setup
-from benchmarks.video_rl.sources import DiscSource, group_spread, sample_scenes
+from benchmarks.video_rl.sources import DiscSource, sample_scenes
+from benchmarks.video_rl.spread import group_spread
 from benchmarks.video_rl.tables import gain_table
 from benchmarks.video_rl.trials import ablation_trials, hacking_trials
 from wm_nodes.apps.cli import main

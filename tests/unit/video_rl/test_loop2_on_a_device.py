@@ -21,6 +21,7 @@ from torch.testing import assert_close
 from video_toys import ACTION_DIM, tiny_network, toy_buffer, toy_rollout_settings
 
 from benchmarks.video_rl.cost import toy_rollout
+from benchmarks.video_rl.discs import training_batch
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import VideoRlConfig
@@ -36,8 +37,8 @@ from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_model.tokenizer_codec import codec_of_world_model
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.pretraining import make_video_model
-from wm_nodes.video_rl.sampling import RecordedContexts
-from wm_nodes.video_rl.toy_scene import NETWORK, ToyContexts, draw_scenes, load_base, training_batch
+from wm_nodes.video_rl.sampling import RecordedContexts, sample_by_ode
+from wm_nodes.video_rl.toy_scene import NETWORK, ToyContexts, draw_scenes, load_base
 from wm_nodes.video_rl.train import post_train, sample_buffers
 from wm_nodes.video_rl.training_run import VideoRun, progress
 from wm_nodes.video_rl.validation import context_scores
@@ -221,7 +222,7 @@ def test_the_preset_gpu_trains_a_video_model_and_post_trains_it_in_a_run_folder(
                 run.train(source.score(request, source.sample(request)))
             run.close()
         assert progress(run_dir) == (2, 2) and device_of(run.network).type == where
-        shown = source.evaluate(heldout, 3).cpu()
+        shown = sample_by_ode(model, heldout, config, 3).cpu()
         assert shown.float().std() > 1
         return found | weights_of(run.network) | {"shown": shown}
 

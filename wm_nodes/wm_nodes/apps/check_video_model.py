@@ -27,7 +27,7 @@ from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_rl.checks import examine
 from wm_nodes.video_rl.horizons import DRIFT, horizon_scores, measure_headroom
 from wm_nodes.video_rl.reference_reward import load_probe
-from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.sampling import sample_by_ode
 from wm_nodes.video_rl.toy_scene import CHANNELS, FRAMES, SIDE, draw_scenes, load_base
 
 VIDEOS = 4
@@ -38,7 +38,7 @@ ModelToCheck = tuple[nn.Module, Condition, tuple[int, int, int, int], VideoRlCon
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--video-model", type=Path, help="folder of an embedded video model; default: the shipped toy")
     parser.add_argument("--context-bags", type=Path, nargs="+", help="bags to take first frames and actions from")
-    parser.add_argument("--public", type=Path, help="folder of a public model, diffusers format (Wan, Cosmos-Predict)")
+    parser.add_argument("--public", type=Path, help="diffusers folder of a public model (Wan, Cosmos-Predict2.5)")
     parser.add_argument("--prompt", default="a robot arm pushes a block across the table", help="for a public model")
     parser.add_argument("--text-only", action="store_true", help="give a public model no first frame")
     parser.add_argument("--picture", type=Path, help="first frame for a public model; default: a test card")
@@ -78,7 +78,7 @@ def _print_headroom(
     probe = load_probe(shipped_model(config.task), folder.device)
     clips = clips.select(torch.arange(min(contexts, len(clips))))
     found = measure_headroom(folder, clips, config, probe)
-    frames = ClipGenerator(folder, clips, config).evaluate(clips, config.rollout.num_steps)
+    frames = sample_by_ode(folder, clips, config, config.rollout.num_steps)
     drift = {name: float(values.mean()) for name, values in horizon_scores(frames, clips, probe, folder).items()}
     columns = (
         "clip", "reward", "best of n", "gain", "object, cm less", "tool, cm less", "std in a group", "codec",

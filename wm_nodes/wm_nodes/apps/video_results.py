@@ -30,12 +30,12 @@ from wm_nodes.reports.summary import as_first_made, write_summary
 from wm_nodes.training.metrics import FILE_NAME, read_metrics
 from wm_nodes.training.weights import load_weights_file
 from wm_nodes.video_model.clips import Clips
-from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_model.success_reader import reader_of
 from wm_nodes.video_rl.heldout_metrics import load_or_measure_unrewarded, make_yardstick
 from wm_nodes.video_rl.pretraining import BEFORE
 from wm_nodes.video_rl.reference_reward import more_is_better
-from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.sampling import sample_by_ode
 from wm_nodes.video_rl.training_run import VIDEO_FILES
 from wm_nodes.video_rl.validation import SECTION, WATCHED, alarm_text, alarms_of, load_or_measure_scores
 from wm_nodes.world_model.position_probe import PositionProbe
@@ -87,8 +87,7 @@ def conclude(
         bag=bag, minutes=minutes, command=command, machine=machine_facts(config.device), date=time.strftime("%Y-%m-%d"),
     ))
     path = write_summary(run_dir, summary)
-    generators = [ClipGenerator(folder, heldout, config) for folder in (base_folder, trained)]
-    strips = _strips(config, run_dir, heldout, generators)
+    strips = _strips(config, run_dir, heldout, (base_folder, trained))
     drawn = curves(
         run_dir / FILE_NAME, run_dir / "pictures" / "curves.png", clip_panels(config.grpo.updates_per_buffer),
         step="buffers trained on",
@@ -110,10 +109,10 @@ def score_change(name: str, before: Sequence[float], after: Sequence[float], see
     return ScoreChange(float(np.mean(before)), float(np.mean(after)), difference, low, high, verdict)
 
 
-def _strips(config: VideoRlConfig, run_dir: Path, heldout: Clips, generators: Sequence[ClipGenerator]) -> list[Picture]:
+def _strips(config: VideoRlConfig, run_dir: Path, heldout: Clips, folders: Sequence[VideoFolder]) -> list[Picture]:
     """The recording, the base model and the trained model from the same first frames and noise."""
     shown = heldout.select(torch.arange(min(STRIPS, len(heldout))))
-    frames = [generator.evaluate(shown, config.evaluation.num_steps).cpu() for generator in generators]
+    frames = [sample_by_ode(folder, shown, config, config.evaluation.num_steps).cpu() for folder in folders]
     rows = dict(zip(("recorded", "before", "after"), [shown.frames, *frames], strict=True))
     pictures, given = [], "first frame" if config.groups.hide_actions else "first frame and actions"
     for index, instruction in enumerate(shown.instructions):

@@ -13,8 +13,7 @@ from wm_nodes.video_model.sampling import (
     step_noise,
     transition,
 )
-from wm_nodes.video_model.schedule import flow_times
-from wm_nodes.video_model.step_window import select_steps, stochastic_steps
+from wm_nodes.video_model.schedule import flow_times, select_steps, stochastic_steps
 
 __all__ = [
     "Condition", "GaussianTransition", "NetworkSettings", "RolloutBuffer", "RolloutBufferError",

@@ -24,7 +24,7 @@ from wm_nodes.video_model.success_reader import SuccessReader
 from wm_nodes.video_model.tokenizer_codec import Codec
 from wm_nodes.video_rl.clip_faults import FaultLimits, FilmedScene, find_faults, measure_fault_limits
 from wm_nodes.video_rl.reference_reward import score_clips
-from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.sampling import sample_by_ode
 from wm_nodes.video_rl.validation import evaluated_contexts
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.positions import columns_of, probe_targets
@@ -121,7 +121,7 @@ def _measure(
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
     """All that can be measured, and why something cannot."""
     contexts, missing, given = evaluated_contexts(heldout, config), dict[str, str](), folder.clip["num_conditioning"]
-    frames = ClipGenerator(folder, contexts, config).evaluate(contexts, config.evaluation.num_steps)
+    frames = sample_by_ode(folder, contexts, config, config.evaluation.num_steps)
     positions, count = by.probe.read(frames), min(config.evaluation.executions, len(contexts))
     found = measure_clips(frames, positions, contexts, by, given)
     if by.reader is None:

@@ -3,18 +3,17 @@
 Shapes: E contexts, n clips of a group, F frames.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor
 
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.statistics import bootstrap_mean
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_rl.reference_reward import all_scores, mix_rewards, score_clips
-from wm_nodes.video_rl.sampling import ClipGenerator, GroupRequest
+from wm_nodes.video_rl.reference_reward import mix_rewards, score_clips
+from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
 from wm_nodes.world_model.position_probe import PositionProbe
 
 LEAST_SHARE = 0.1
@@ -69,8 +68,7 @@ class Headroom:
 
 
 def measure_headroom(
-    folder: VideoFolder, contexts: Clips, config: VideoRlConfig, probe: PositionProbe,
-    on_horizon: Callable[[], object] = lambda: None,
+    folder: VideoFolder, contexts: Clips, config: VideoRlConfig, probe: PositionProbe
 ) -> list[Headroom]:
     """Return the head-room of groups.group_size clips by the rewards of `config`, one per horizon, or only that of
     whole clips where the model makes such.
@@ -81,17 +79,15 @@ def measure_headroom(
     config = config.with_values(groups=config.groups.with_values(history=0), window=config.window.with_values(
         strategy="all"
     ))
-    generator, n, found = ClipGenerator(folder, contexts, config), config.groups.group_size, list[Headroom]()
+    source, n, found = RecordedContexts(folder, contexts, config, probe), config.groups.group_size, list[Headroom]()
     plain = GroupRequest(tuple(range(len(contexts))), n, 0, 0, config.groups.shared_noise)
     for history in _histories(folder, contexts):
         request = replace(plain, history=history, iteration=history or 0)
-        buffer, recorded = generator.sample(request), generator.references(request)
-        K, one = buffer.condition.num_conditioning, recorded.select(torch.arange(0, len(recorded), n))
-        codec, weights = folder.codec, config.rewards
-        scores = all_scores(codec.decode(buffer.rollout.latents), recorded, probe, codec, K, weights)
-        coded = codec.decode(codec.encode(one.frames))
-        ceiling = mix_rewards(all_scores(coded, one, probe, codec, K, weights), weights)
-        rewards = mix_rewards(scores, weights).view(-1, n)
+        buffer = source.score(request, source.sample(request))
+        single, K = replace(request, group_size=1), buffer.condition.num_conditioning
+        coded = folder.codec.decode(folder.codec.encode(source.references(single).frames))
+        ceiling = mix_rewards(source.scores(single, coded, K), config.rewards)
+        rewards = buffer.rewards["total"].view(-1, n)
         best = rewards.argmax(1, keepdim=True)
 
         def gained(values: Tensor, sign: int, best: Tensor = best) -> Interval:
@@ -101,9 +97,8 @@ def measure_headroom(
         found.append(Headroom(
             (history or 0) + 1, float(rewards.mean()), float(rewards.amax(1).mean()), gained(rewards, 1),
             float(rewards.std(1, correction=0).mean()), float(ceiling.mean()),
-            gained(scores["object_cm"], -1), gained(scores["tool_cm"], -1),
+            gained(buffer.rewards["object_cm"], -1), gained(buffer.rewards["tool_cm"], -1),
         ))
-        on_horizon()
     return found
 
 

@@ -26,7 +26,7 @@ from wm_nodes.video_rl.reference_reward import (
     more_is_better,
 )
 from wm_nodes.video_rl.reward_hacking import HackedMetric, find_hacked_metrics
-from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.sampling import sample_by_ode
 from wm_nodes.world_model.position_probe import PositionProbe
 
 SECTION = "heldout"
@@ -47,7 +47,7 @@ def context_scores(
     """
     contexts = evaluated_contexts(heldout, config)
     folder.network.eval()
-    frames = ClipGenerator(folder, contexts, config).evaluate(contexts, config.evaluation.num_steps)
+    frames = sample_by_ode(folder, contexts, config, config.evaluation.num_steps)
     scores = all_scores(frames, contexts, probe, folder.codec, folder.clip["num_conditioning"], config.rewards)
     return {name: scores[name] for name in OUTCOMES} if config.groups.hide_actions else scores
 

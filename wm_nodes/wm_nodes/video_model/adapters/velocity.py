@@ -3,7 +3,6 @@
 Shapes: B batch, C channels, F latent frames, K given frames, H W latent grid, L text tokens of E values.
 """
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar, Literal
@@ -20,9 +19,9 @@ CfgConvention = Literal["unconditional", "conditional"]
 def normalised_cfg(guidance_scale: float, convention: CfgConvention) -> float:
     """Return our g of v_u + g (v_c - v_u) for a model card's scale.
 
-    convention: what the scaled difference is added to. `unconditional`: v_u + scale (v_c - v_u), off at 1 (Wan,
-    Cosmos text2world). `conditional`: v_c + scale (v_c - v_u), off at 0 (Cosmos-Predict2 and 2.5 in diffusers, which
-    also switch it off at any scale <= 1).
+    convention: what the scaled difference is added to. `unconditional`: v_u + scale (v_c - v_u), off at 1 (Wan).
+    `conditional`: v_c + scale (v_c - v_u), off at 0 (Cosmos-Predict2.5 in diffusers, which also switches it off at any
+    scale <= 1).
     """
     return guidance_scale if convention == "unconditional" else 1 + guidance_scale
 
@@ -47,18 +46,13 @@ class PublicVelocity(nn.Module):
         """Return RolloutConfig.cfg for the scale that this model's card gives."""
         return normalised_cfg(guidance_scale, self.cfg_convention)
 
-    def transformers(self) -> list[Any]:
-        """Every network that samples, in order of falling noise."""
-        return [self.transformer]
-
     def project_text(self, text: Tensor) -> Tensor:
         """Return the text as a Condition should keep it, (B, L, E)."""
         return text
 
     def enable_gradient_checkpointing(self) -> None:
         """Trade a second forward pass for the activations' memory; same gradients."""
-        for transformer in self.transformers():
-            transformer.enable_gradient_checkpointing()
+        self.transformer.enable_gradient_checkpointing()
 
     @contextmanager
     def disable_adapter(self) -> Iterator[None]:
@@ -113,8 +107,3 @@ def tuner_layers(model: nn.Module) -> list[Any]:
         return []
     base = package("peft.tuners.tuners_utils").BaseTunerLayer
     return [module for module in model.modules() if isinstance(module, base)]
-
-
-def num_cells(x: Tensor, patch: tuple[int, int, int]) -> int:
-    """Tokens of one latent frame."""
-    return math.prod(size // side for size, side in zip(x.shape[3:], patch[1:]))
