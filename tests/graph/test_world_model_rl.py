@@ -113,7 +113,7 @@ def test_the_newest_weights_are_measured_after_and_the_base_model_once_before(
 ) -> None:
     summary, folder = read_summary(run_dir), load_video_folder(run_dir / "video_model")
     before = json.loads((run_dir / "evaluations" / "before.json").read_text())
-    assert before["sha256"] == folder.manifest["sha256"]["network.safetensors"]
+    assert before["of"]["sha256"] == folder.manifest["sha256"]["network.safetensors"]
     for name, row in summary["scores"].items():
         assert row["before"] == pytest.approx(folder.manifest["heldout"][name], rel=1e-12)
     heldout = load_clips(sorted((run_dir / "data" / "heldout").glob("shard_*")), config.model.stride)

@@ -108,7 +108,7 @@ def test_flow_matching_towards_what_is_kept_brings_the_model_nearer_to_it_and_eq
     assert learners[0].version == 40
     first, second = (weights(learner.model) for learner in learners)
     assert all(torch.equal(first[name], second[name]) for name in first)
-    report = learners[0].train(buffer)
+    report = learners[0].train(replace(buffer, policy_version=40))
     assert report.kept == (6 if keep == "all" else 2) and report.updates[0].transitions == 2 * report.kept
 
 

@@ -433,7 +433,6 @@ def test_a_video_does_not_depend_on_the_batch_it_is_sampled_in() -> None:
     small, large = (sampled(toy_rollout_settings(micro_batch=size), count=5) for size in (2, 16))
     assert_close(small.latents, large.latents)
     assert_close(small.noise_share, large.noise_share)
-    assert small.seeds.tolist() == [0, 1, 2, 3, 4]
 
 
 def test_equal_initial_noise_with_own_step_noise_gives_different_videos() -> None:

@@ -178,7 +178,7 @@ def test_other_bytes_and_files_that_lack_a_part_are_refused() -> None:
             RolloutBuffer.from_bytes(data)
 
 
-@pytest.mark.parametrize("name", ["rollout.latents", "rollout.states", "condition.text", "group_ids", "rollout.seeds"])
+@pytest.mark.parametrize("name", ["rollout.latents", "rollout.states", "condition.text", "group_ids", "rollout.zeta"])
 def test_a_file_that_lacks_one_tensor_is_refused_by_its_name(name: str) -> None:
     buffer = toy_buffer(Analytic(swirl), toy_rollout_settings())
     data = buffer.to_bytes()

@@ -90,8 +90,8 @@ class Line(torch.nn.Module):
 
 def drawn(learner: GrpoLearner, buffer: RolloutBuffer, rows: Rows) -> tuple[np.ndarray, ...]:
     """x_0, eps and x_t of the rows, (M, C, F, H, W) without the given frame, and t, float64."""
-    assert isinstance(learner._terms, NftTerms)
-    t, noise = learner._terms._draw(buffer, rows, learner.version)
+    assert isinstance(learner.terms, NftTerms)
+    t, noise = learner.terms._draw(buffer, rows, learner.version)
     x_0 = buffer.rollout.latents[rows.videos].double().numpy()[:, :, 1:]
     eps, times = noise.double().numpy()[:, :, 1:], t.numpy().reshape(-1, 1, 1, 1, 1)
     return x_0, eps, (1 - times) * x_0 + times * eps, times
@@ -144,7 +144,7 @@ def test_the_best_clips_with_beta_1_are_learned_by_flow_matching_in_the_space_of
     learner = make()
     buffer, rows = buffer_of(learner), all_rows(8)
     found = gradient(learner, buffer, [2.5] * 8)
-    _, noise = learner._terms._draw(buffer, rows, 0)
+    _, noise = learner.terms._draw(buffer, rows, 0)
     t, x_0 = torch.from_numpy(drawn(learner, buffer, rows)[3]).float(), buffer.rollout.latents[rows.videos]
     condition = buffer.condition.rows(rows.videos)
     x_t = torch.cat([condition.frames, ((1 - t) * x_0 + t * noise)[:, :, 1:]], 2)
@@ -194,15 +194,15 @@ def test_given_frames_stay_clean_and_count_nothing() -> None:
 def test_times_lie_one_in_each_part_of_the_sampler_s_range_and_every_update_draws_anew() -> None:
     learner = make(times=4)
     buffer, rows = buffer_of(learner), all_rows(8, 4)
-    times, noise = learner._terms._draw(buffer, rows, 0)
+    times, noise = learner.terms._draw(buffer, rows, 0)
     uniform = times / (3 - 2 * times)  # the inverse of shift 3
     assert (uniform * 4).floor().int().tolist() == [0, 1, 2, 3] * 8 and len(set(times.tolist())) == 32
     assert float(times.mean()) > 0.6, "shifted towards the noise"
-    again, later = learner._terms._draw(buffer, rows, 0), learner._terms._draw(buffer, rows, 1)
+    again, later = learner.terms._draw(buffer, rows, 0), learner.terms._draw(buffer, rows, 1)
     assert torch.equal(again[1], noise) and torch.equal(again[0], times)
     assert not (later[1] == noise).any() and not (later[0] == times).any()
     part = rows.part(torch.tensor([17, 3]))
-    assert torch.equal(learner._terms._draw(buffer, part, 0)[1], noise[[17, 3]])
+    assert torch.equal(learner.terms._draw(buffer, part, 0)[1], noise[[17, 3]])
 
 
 # the learner's contracts
@@ -279,10 +279,10 @@ def test_the_old_weights_follow_after_each_buffer(decay: float, ramp: float, kep
     """Two optimizer steps: d = min(2 ramp, decay)."""
     learner = make(old_decay=decay, old_ramp=ramp)
     start = weights(learner.model)
-    assert all(torch.equal(value, start[name]) for name, value in learner._terms.old.items())
+    assert all(torch.equal(value, start[name]) for name, value in learner.terms.old.items())
     learner.train(buffer_of(learner))
     for name, value in weights(learner.model).items():
-        assert_close(learner._terms.old[name], kept * start[name] + (1 - kept) * value)
+        assert_close(learner.terms.old[name], kept * start[name] + (1 - kept) * value)
 
 
 STATEFUL = [{}, {"old_decay": 0.5, "old_ramp": 0.1}, {"kl": FROZEN}]
@@ -301,7 +301,7 @@ def test_three_rounds_equal_two_a_resume_and_one_bit_for_bit(tmp_path: Path, cha
     train_rounds(resumed, range(2, 3))
     for name, value in weights(straight.model).items():
         assert torch.equal(value, weights(resumed.model)[name]), name
-        assert torch.equal(straight._terms.old[name], resumed._terms.old[name]), name
+        assert torch.equal(straight.terms.old[name], resumed.terms.old[name]), name
     assert any(not torch.equal(value, weights(other.model)[name]) for name, value in weights(straight.model).items())
 
 
@@ -321,7 +321,7 @@ def test_a_gradient_that_is_not_finite_undoes_the_whole_buffer(changes: dict[str
     learner, undisturbed = make(**changes), make(**changes)
     for one in (learner, undisturbed):
         train_rounds(one, range(1))
-    buffer, before, old = buffer_of(learner, iteration=7), weights(learner.model), copy.deepcopy(learner._terms.old)
+    buffer, before, old = buffer_of(learner, iteration=7), weights(learner.model), copy.deepcopy(learner.terms.old)
     calls = iter(range(1000))
     first = len(learner.rows(buffer, torch.ones(8).bool())) // 8 + 1
     handle = learner.parameters[0].register_hook(lambda g: g * (math.nan if next(calls) >= first else 1.0))
@@ -330,7 +330,7 @@ def test_a_gradient_that_is_not_finite_undoes_the_whole_buffer(changes: dict[str
     handle.remove()
     assert learner.version == 2
     assert all(torch.equal(value, before[name]) for name, value in weights(learner.model).items())
-    assert all(torch.equal(value, old[name]) for name, value in learner._terms.old.items())
+    assert all(torch.equal(value, old[name]) for name, value in learner.terms.old.items())
     for one in (learner, undisturbed):
         one.train(buffer)
         one.train(buffer_of(one, iteration=8))
@@ -350,7 +350,7 @@ def test_the_kl_is_the_squared_distance_of_the_velocities_from_the_anchor_s() ->
     with torch.no_grad():
         model.offset.fill_(0.5)
     plain = GrpoLearner(model, nft_config(), ODE, seed=0)
-    plain._terms.old = {"offset": torch.zeros(())}
+    plain.terms.old = {"offset": torch.zeros(())}
     assert learner.gradients(buffer, all_rows(8), signal(ADVANTAGES))["kl"] / 24 == pytest.approx(0.25)
     found = gradient(learner, buffer, ADVANTAGES) - gradient(plain, buffer, ADVANTAGES)
     assert float(found) == pytest.approx(2.0 * 2 * 0.5, rel=1e-5), "beta d v^2 / d v"

@@ -86,7 +86,7 @@ class FlowMatchingLearner:
             raise FloatingPointError(f"the gradient is not finite at version {self.version}; lower the learning rate")
         self._optimizer.step()
         self.version += 1
-        return UpdateReport(-float(loss.detach()), NAN, NAN, NAN, NAN, norm, len(repeated), NAN, NAN, NAN)
+        return UpdateReport(-float(loss.detach()), NAN, NAN, NAN, NAN, norm, len(repeated))
 
 
 def kept_clips(buffer: RolloutBuffer, keep: Kept) -> Tensor:
@@ -118,7 +118,7 @@ class RecordedTargets(RecordedContexts):
         settings, N = self.config.rollout, len(latents)
         none = latents.new_zeros(N, 0, *latents.shape[1:])
         rollout = VideoRollout(
-            latents, (), none, none[:, :, :1], none, torch.zeros(N, dtype=torch.int64), latents.new_zeros(0),
+            latents, (), none, none[:, :, :1], none, latents.new_zeros(0)
         )
         rows = torch.arange(N)
         return RolloutBuffer(

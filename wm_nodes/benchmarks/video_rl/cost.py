@@ -78,9 +78,15 @@ def measure_anchors(
         for anchor in ANCHORS:
             kl = learner.kl.with_values(anchor=anchor, dual_every=1)
             grpo = GrpoLearner(model, learner.with_values(kl=kl, learning_rate=0.0), rollout, seed=0)
-            updates = grpo.train(buffer).updates
-            for part in PARTS:
-                times[anchor][part].append(sum(getattr(update, f"{part}_seconds") for update in updates))
+            device = device_of(model)
+            with (
+                clocked(grpo.terms, "objective", device=device) as forward,
+                clocked(grpo.terms, "kl", device=device) as kl_spent,
+                clocked(torch.Tensor, "backward", device=device) as backward,
+            ):
+                grpo.train(buffer)
+            for part, spent in zip(PARTS, (forward, kl_spent, backward), strict=True):
+                times[anchor][part].append(spent[0])
     weights = sum(p.nbytes for p in model.parameters())
     kept = {"buffer": buffer.rollout.zeta.nbytes + buffer.rollout.mask.nbytes, "frozen": weights}
     kept["dual"] = kept["buffer"] + weights

@@ -116,34 +116,19 @@ def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
         learning_rate=NFT_RATE,
     )
     cps = learner.with_values(logprob_weight="cps")
-    frozen = BASE.grpo.kl.with_values(beta=learner.kl.beta, anchor="frozen")
     plain = sampler_setup("CPS 0.6", by_arm("cps", 0.6), cps)
-    matched = sampler_setup("DynDiff 0.4 sparse, rms, cps", dyndiff(0.4, "sparse", "rms"), cps)
-    sparse = sampler_setup("DynDiff 0.6 sparse, cps", dyndiff(0.6, "sparse"), cps)
     gated = sampler_setup("DynDiff 0.6 gated, rms, cps", dyndiff(0.6, "gated", "rms"), cps)
-    quiet = [
-        sampler_setup("CPS 0.46", by_arm("cps", 0.46), cps),  # spends what DynDiff 0.6 gated, rms does
-        sampler_setup("CPS 0.2", by_arm("cps", 0.2), cps),
-        sampler_setup("DynDiff 0.2 sparse, rms, cps", dyndiff(0.2, "sparse", "rms"), cps),
-    ]
+    quiet = sampler_setup("CPS 0.46", by_arm("cps", 0.46), cps)  # spends what DynDiff 0.6 gated, rms does
     flow = sampler_setup("Flow-GRPO 0.7", by_arm("flow", 0.7), learner)
     return [
         plain, sampler_setup("CPS 0.6, full", by_arm("cps", 0.6), learner),
         flow, replace(_in_window(flow), name="Mix-GRPO 0.7"),
         sampler_setup("DanceGRPO 0.3", by_arm("dance", 0.3), learner),
         sampler_setup("SAGE 0.5", by_arm("sage", 0.5), learner),
-        sampler_setup("DynDiff 0.6 gated", dyndiff(0.6), learner),
-        sampler_setup("DynDiff 0.6 sparse", dyndiff(0.6, "sparse"), learner),
-        sampler_setup("DynDiff 0.4 sparse, rms", dyndiff(0.4, "sparse", "rms"), learner),
-        matched, sparse, gated,
-        *(replace(one, name=f"{one.name}, frozen", grpo=one.grpo.with_values(kl=frozen)) for one in (plain, matched)),
-        *(
-            replace(sampler, name=f"{sampler.name}, shared", shared_noise=True)
-            for sampler in (plain, matched, sparse, gated, *quiet)
-        ),
-        *(replace(_in_window(sampler), name=f"{sampler.name}, window") for sampler in (plain, gated)),
+        sampler_setup("DynDiff 0.6 gated", dyndiff(0.6), learner), gated,
+        *(replace(one, name=f"{one.name}, shared", shared_noise=True) for one in (plain, gated, quiet)),
+        *(replace(_in_window(one), name=f"{one.name}, window") for one in (plain, gated)),
         sampler_setup("signed FM, ODE", by_arm("ode", 0.0), nft),
-        sampler_setup("signed FM, CPS 0.6", by_arm("cps", 0.6), nft),
     ]
 
 

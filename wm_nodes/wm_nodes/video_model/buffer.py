@@ -61,10 +61,6 @@ class RolloutBuffer:
     def __len__(self) -> int:
         return len(self.group_ids)
 
-    @property
-    def num_bytes(self) -> int:
-        return sum(tensor.nbytes for tensor in self._tensors().values())
-
     def to(self, device: torch.device | str) -> "RolloutBuffer":
         """The same buffer with its videos and condition on a device."""
         return replace(self, rollout=self.rollout.to(device), condition=self.condition.to(device))

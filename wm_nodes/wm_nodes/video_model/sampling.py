@@ -19,7 +19,7 @@ from wm_nodes.video_model.kernels import Step, StepContext, ode_step, step, with
 from wm_nodes.video_model.network import VelocityModel, guided_velocity
 from wm_nodes.video_model.schedule import flow_times
 
-ROWS = ("latents", "states", "mask", "zeta", "seeds")
+ROWS = ("latents", "states", "mask", "zeta")
 """Tensors of a VideoRollout that have a row per video."""
 
 
@@ -37,8 +37,6 @@ class VideoRollout:
     """(N, S, 1, F, H, W)."""
     zeta: Tensor
     """Normalised noise (N, S, C, F - K, H, W), float32 or bfloat16."""
-    seeds: Tensor
-    """Of each video's step noise, int64 (N,)."""
     noise_share: Tensor
     """rms of std / s over generated elements, (S,), the noise budget that was spent."""
 
@@ -57,9 +55,8 @@ class VideoRollout:
         return replace(self, **{name: getattr(self, name)[index] for name in ROWS})
 
     def to(self, device: torch.device | str) -> "VideoRollout":
-        """The same videos on a device; seeds stay in the host's memory."""
-        names = ("latents", "states", "mask", "noise_share", "zeta")
-        return replace(self, **{name: getattr(self, name).to(device) for name in names})
+        """The same videos on a device."""
+        return replace(self, **{name: getattr(self, name).to(device) for name in (*ROWS, "noise_share")})
 
     def state(self, k: int) -> Tensor:
         """x before step k, (N, C, F, H, W), storage dtype."""
@@ -107,19 +104,19 @@ def sample_videos(
         )
     if settings.sampler.arm == "ode" or settings.sampler.eta == 0:
         chosen = []  # no step has noise
-    rollout = _unsampled(noise, seeds, condition.num_conditioning, settings, chosen)
+    rollout = _unsampled(noise, condition.num_conditioning, settings, chosen)
     spent = torch.zeros(len(chosen), device=noise.device)
     for i in range(0, len(noise), settings.micro_batch):
         rows = slice(i, i + settings.micro_batch)
         part = rollout.rows(rows)
-        squares = _sample(model, condition.rows(rows), noise[rows], settings, part)
+        squares = _sample(model, condition.rows(rows), noise[rows], seeds[rows], settings, part)
         spent.add_(squares, alpha=len(part.latents) / len(noise))
         on_progress(min(rows.stop, len(noise)), len(noise))
     return replace(rollout, noise_share=spent.sqrt().to(rollout.latents.device))
 
 
 def _unsampled(
-    noise: Tensor, seeds: Tensor, num_conditioning: int, settings: RolloutConfig, stochastic: list[int]
+    noise: Tensor, num_conditioning: int, settings: RolloutConfig, stochastic: list[int]
 ) -> VideoRollout:
     """A rollout whose tensors are yet to be written, in place: kept once, without copies of its parts."""
     N, C, frames, H, W = noise.shape
@@ -133,13 +130,13 @@ def _unsampled(
         states=room(N, states, C, frames, H, W, dtype=stored),
         mask=room(N, S, 1, frames, H, W),
         zeta=room(N, S, C, frames - num_conditioning, H, W, dtype=stored),
-        seeds=seeds.clone(),
         noise_share=room(S),
     )
 
 
 def _sample(
-    model: VelocityModel, condition: Condition, noise: Tensor, settings: RolloutConfig, rollout: VideoRollout
+    model: VelocityModel, condition: Condition, noise: Tensor, seeds: Tensor, settings: RolloutConfig,
+    rollout: VideoRollout,
 ) -> Tensor:
     """Sample one micro-batch into its rows of `rollout`; return the squared noise_share of its steps, (S,)."""
     times, N = flow_times(settings.num_steps, settings.shift), len(noise)
@@ -158,7 +155,7 @@ def _sample(
             x = with_conditioning(ode_step(x, v, t, s, context, settings.sampler).mean, context.conditioning)
             continue
         law = step(x, v, t, s, context, settings.sampler)
-        z = step_noise(tuple(x.shape[1:]), rollout.seeds, k).to(x.device)
+        z = step_noise(tuple(x.shape[1:]), seeds, k).to(x.device)
         x = with_conditioning((law.mean + law.std * z).to(storage).float(), context.conditioning)
         keep_transition(rollout, k, x, law)
         spent = (law.std[:, :, context.num_conditioning :] / float(times[k + 1])).square()

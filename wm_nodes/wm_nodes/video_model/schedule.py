@@ -1,5 +1,5 @@
-"""Times of a flow-matching sampler (DD-3a), which of its steps are stochastic (DD-25: the window of Mix-GRPO), and which
-of those train (DD-26). t = 1 is pure noise, t = 0 is data; x_t = (1 - t) x_0 + t eps.
+"""Times of a flow-matching sampler (DD-3a), which of its steps are stochastic (DD-25, the window of Mix-GRPO), and
+which of those train (DD-26). t = 1 is pure noise, t = 0 is data; x_t = (1 - t) x_0 + t eps.
 
 Steps are numbered 0 to T - 1; the last one (s = 0) is never stochastic, so T - 1 steps can be.
 """

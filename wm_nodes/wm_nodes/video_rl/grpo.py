@@ -13,10 +13,8 @@ micro-batches.
 
 import json
 import math
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +23,7 @@ from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 
 from wm_nodes.config.video import GrpoConfig, RolloutConfig
-from wm_nodes.core.device import device_of, synchronize
+from wm_nodes.core.device import device_of
 from wm_nodes.training import checkpoint
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import WeightsError, check_same_layout
@@ -34,7 +32,7 @@ from wm_nodes.video_rl.group_advantages import GroupAdvantages, best_of_n, group
 from wm_nodes.video_rl.nft import NftTerms
 from wm_nodes.video_rl.ratio_and_kl import GrpoTerms, Rows
 
-SUMS = ("objective", "kl", "ratio", "low", "high", "forward_s", "kl_s", "backward_s")
+SUMS = ("objective", "kl", "ratio", "low", "high")
 MAX_SKIPPED = 5
 """So many buffers in a row whose rewards differ in no group end a training: nothing can be learned from the reward."""
 
@@ -60,12 +58,6 @@ class UpdateReport:
     """Before it is clipped."""
     transitions: int
     """(video, step) pairs."""
-    forward_seconds: float
-    """Of the weights that train."""
-    kl_seconds: float
-    """The anchor's forward and the KL."""
-    backward_seconds: float
-    """Of both."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +120,7 @@ class GrpoLearner:
         self._optimizer = torch.optim.AdamW(
             self.parameters, lr=settings.learning_rate, weight_decay=settings.weight_decay
         )
-        self._terms = (NftTerms if settings.objective == "nft" else GrpoTerms)(model, settings, rollout, seed)
+        self.terms = (NftTerms if settings.objective == "nft" else GrpoTerms)(model, settings, rollout, seed)
 
     def train(self, buffer: RolloutBuffer) -> BufferReport:
         """Make `updates_per_buffer` optimizer steps; nothing has changed when it raises.
@@ -168,7 +160,7 @@ class GrpoLearner:
             steps = self.settings.updates_per_buffer if len(rows) else 0
             updates = tuple(self._update(buffer, rows, advantages) for _ in range(steps))
             if updates:
-                self._terms.move_old(self.version)
+                self.terms.move_old(self.version)
         except BaseException:
             self._restore(before)
             raise
@@ -194,38 +186,27 @@ class GrpoLearner:
 
     def rows(self, buffer: RolloutBuffer, kept_N: Tensor) -> Rows:
         """Return what every update on the buffer trains on: the chosen steps of the kept videos."""
-        return Rows(*torch.nonzero(self._terms.choose(buffer) & kept_N.unsqueeze(1), as_tuple=True))
+        return Rows(*torch.nonzero(self.terms.choose(buffer) & kept_N.unsqueeze(1), as_tuple=True))
 
     def gradients(self, buffer: RolloutBuffer, rows: Rows, advantages: GroupAdvantages) -> dict[str, float]:
         """Accumulate the gradient of L = -J + beta KL over the rows into .grad; return the sums for a report."""
-        device, total, seconds = device_of(self.model), len(rows), [0.0, 0.0, 0.0]
+        device, total = device_of(self.model), len(rows)
         sums = torch.zeros(5, dtype=torch.float64, device=device)
         signals = advantages.advantages_N.to(device, torch.float32)
         own = self.ranks.share(torch.arange(total))
         for index in torch.split(own, self.settings.micro_batch):  # type: ignore[no-untyped-call]
-            clock, part = [self._now(device)], rows.part(index)
-            current: Any = self._terms.objective(buffer, part, signals[part.videos.to(device)], self.version)
-            objective = current.objective
-            clock.append(self._now(device))
-            kl = self._terms.kl(current, buffer, part, self.version)
-            clock.append(self._now(device))
-            loss = (self.settings.kl.beta * kl - objective).sum() / total
+            part = rows.part(index)
+            current: Any = self.terms.objective(buffer, part, signals[part.videos.to(device)], self.version)
+            kl = self.terms.kl(current, buffer, part, self.version)
+            loss = (self.settings.kl.beta * kl - current.objective).sum() / total
             loss.backward()
-            clock.append(self._now(device))
-            seconds = [spent + end - start for spent, (start, end) in zip(seconds, pairwise(clock), strict=True)]
-            if len(index):  # a share of none is not a number
-                sums[0] += objective.detach().sum().double()
-                sums[1:] += self._terms.sums(current, kl)
-        values = torch.cat([sums.cpu(), torch.tensor(seconds, dtype=torch.float64)])  # the only wait for the device
+            sums[0] += current.objective.detach().sum().double()
+            sums[1:] += self.terms.sums(current, kl)
+        values = sums.cpu()  # the only wait for the device
         self.ranks.sum_(values)
         return dict(zip(SUMS, values.tolist(), strict=True))
 
     # internals
-
-    @staticmethod
-    def _now(device: torch.device) -> float:
-        synchronize(device)
-        return time.perf_counter()
 
     def _update(self, buffer: RolloutBuffer, rows: Rows, advantages: GroupAdvantages) -> UpdateReport:
         self.model.train()
@@ -243,24 +224,23 @@ class GrpoLearner:
         return UpdateReport(
             objective=sums["objective"] / total, kl=sums["kl"] / total, ratio_mean=sums["ratio"] / total,
             clip_low_share=sums["low"] / total, clip_high_share=sums["high"] / total, grad_norm=norm,
-            transitions=total, forward_seconds=sums["forward_s"],
-            kl_seconds=sums["kl_s"], backward_seconds=sums["backward_s"],
+            transitions=total,
         )
 
     def _snapshot(self) -> dict[str, Any]:
         """Copy what a failed train() puts back, where it is: on a GPU that is once more the memory of the weights that
         train and of their two moments, and nothing crosses to the host."""
         return {
-            "model": self._terms.trained(),
+            "model": self.terms.trained(),
             "optimizer": {k: v.detach().clone() for k, v in checkpoint.optimizer_tensors(self._optimizer).items()},
-            "old": self._terms.old,  # replaced, never changed
+            "old": self.terms.old,  # replaced, never changed
             "version": self.version,
         }
 
     def _restore(self, before: dict[str, Any]) -> None:
         _set_trained(self.model, before["model"])
         checkpoint.restore_optimizer(self._optimizer, before["optimizer"])
-        self._terms.old, self.version = before["old"], before["version"]
+        self.terms.old, self.version = before["old"], before["version"]
 
     # checkpoints
 
@@ -268,7 +248,7 @@ class GrpoLearner:
         """Write everything that train() depends on, atomically: trained, anchor's and old weights, optimizer, counters.
         """
         sections = {
-            "model": dict(_trained_parameters(self.model)), "anchor": self._terms.anchor, "old": self._terms.old,
+            "model": dict(_trained_parameters(self.model)), "anchor": self.terms.anchor, "old": self.terms.old,
             "optimizer": checkpoint.optimizer_tensors(self._optimizer),
         }
         header = {
@@ -291,13 +271,13 @@ class GrpoLearner:
             raise ValueError(f"{path} has seed {header['seed']}, this run has {self.seed}; use a new run folder")
         weights = checkpoint.section(tensors, "model.")
         check_same_layout(dict(_trained_parameters(self.model)), weights, what=str(path))
-        own = {"anchor.": (self._terms.anchor, "kl.anchor"), "old.": (self._terms.old, "objective")}
+        own = {"anchor.": (self.terms.anchor, "kl.anchor"), "old.": (self.terms.old, "objective")}
         for prefix, (values, setting) in own.items():
             if bool(values) != bool(checkpoint.section(tensors, prefix)):
                 raise ValueError(f"{path} was made with another grpo.{setting}; resume with its settings")
         _set_trained(self.model, weights)
         device = device_of(self.model)
-        self._terms.anchor, self._terms.old = (
+        self.terms.anchor, self.terms.old = (
             {name: value.to(device) for name, value in checkpoint.section(tensors, prefix).items()} for prefix in own
         )
         checkpoint.restore_optimizer(self._optimizer, checkpoint.section(tensors, "optimizer."))

@@ -1,9 +1,9 @@
 """Metrics of clips that are never trained on. Shapes: N clips, F frames, H W 3 image, P positions."""
 
-import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +13,6 @@ from torch import Tensor
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.config.tasks import get_task
 from wm_nodes.config.video import VideoRlConfig
-from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import FloatArray
 from wm_nodes.environments.cameras import ROBOT_BASE, still_cameras
 from wm_nodes.environments.replay import execute_paths
@@ -25,7 +24,7 @@ from wm_nodes.video_model.tokenizer_codec import Codec
 from wm_nodes.video_rl.clip_faults import FaultLimits, FilmedScene, find_faults, measure_fault_limits
 from wm_nodes.video_rl.reference_reward import score_clips
 from wm_nodes.video_rl.sampling import sample_by_ode
-from wm_nodes.video_rl.validation import evaluated_contexts
+from wm_nodes.video_rl.validation import evaluated_contexts, measured_once
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.positions import columns_of, probe_targets
 
@@ -99,21 +98,21 @@ def load_or_measure_unrewarded(
 ) -> Unrewarded:
     """Measure one ODE clip of each of the first `evaluation.contexts` held-out contexts by both models, before and
     after; read from `path` where they are of the same weights, else written there."""
-    weights = [pack_weights(model.network).sha256 for model in models]
-    of = {"sha256": weights, "evaluation": config.evaluation.model_dump()}
-    if path.is_file() and (saved := json.loads(path.read_text(encoding="utf-8")))["of"] == of:
-        return Unrewarded(**saved["found"])
-    try:
-        by = yardstick()
-        (before, missing), (after, missing_after) = (_measure(model, heldout, by, config) for model in models)
+    def measure() -> dict[str, Any]:
+        try:
+            by = yardstick()
+            (before, missing), (after, missing_after) = (_measure(model, heldout, by, config) for model in models)
+        except ValueError as error:
+            return {"before": {}, "after": {}, "missing": dict.fromkeys(UNREWARDED, str(error))}
         missing |= missing_after
         known = [name for name in UNREWARDED if name not in missing]
         first, last = ({name: some[name].tolist() for name in known} for some in (before, after))
-        found = Unrewarded(first, last, missing)
-    except ValueError as error:
-        found = Unrewarded({}, {}, dict.fromkeys(UNREWARDED, str(error)))
-    write_atomic(path, json.dumps({"of": of, "found": asdict(found)}).encode())
-    return found
+        return {"before": first, "after": last, "missing": missing}
+
+    weights = [pack_weights(model.network).sha256 for model in models]
+    return Unrewarded(
+        **measured_once(path, {"sha256": weights, "evaluation": config.evaluation.model_dump()}, measure)
+    )
 
 
 def _measure(

@@ -6,6 +6,7 @@ Shapes: E contexts.
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -61,12 +62,19 @@ def load_or_measure_scores(
     path: Path, folder: VideoFolder, heldout: Clips, probe: PositionProbe, config: VideoRlConfig
 ) -> dict[str, list[float]]:
     """Return context_scores(): read from `path` where they are of the same weights, else measured and written there."""
-    sha256 = pack_weights(folder.network).sha256
-    if path.is_file() and (saved := read_json(path, AGAIN))["sha256"] == sha256:
-        return dict(saved["scores"])
-    scores = {name: values.tolist() for name, values in context_scores(folder, heldout, probe, config).items()}
-    write_atomic(path, json.dumps({"sha256": sha256, "scores": scores}).encode())
-    return scores
+    def measure() -> dict[str, list[float]]:
+        return {name: values.tolist() for name, values in context_scores(folder, heldout, probe, config).items()}
+
+    return measured_once(path, {"sha256": pack_weights(folder.network).sha256}, measure)
+
+
+def measured_once(path: Path, of: Mapping[str, Any], measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return what `measure` finds, as JSON: read from `path` where that is `of` the same, else written there."""
+    if path.is_file() and (saved := read_json(path, AGAIN)).get("of") == of:
+        return dict(saved["found"])
+    found = measure()
+    write_atomic(path, json.dumps({"of": of, "found": found}).encode())
+    return found
 
 
 def validation_scores(
