@@ -13,9 +13,7 @@ TARGETS = ("to_q", "to_k", "to_v", "to_out.0")
 """Attention projections of Wan's and Cosmos's blocks."""
 
 
-def add_lora(
-    model: PublicVelocity, rank: int, alpha: float | None = None, *, targets: tuple[str, ...] = TARGETS, seed: int = 0
-) -> None:
+def add_lora(model: PublicVelocity, rank: int, alpha: float | None = None, *, seed: int = 0) -> None:
     """Add an adapter in place, which starts as no change; it alone trains afterwards, in float32.
 
     Args:
@@ -27,7 +25,7 @@ def add_lora(
     if tuner_layers(model):
         raise ValueError("this model has a LoRA adapter already")
     config = package("peft").LoraConfig(
-        r=rank, lora_alpha=rank if alpha is None else alpha, target_modules=list(targets), lora_dropout=0.0
+        r=rank, lora_alpha=rank if alpha is None else alpha, target_modules=list(TARGETS), lora_dropout=0.0
     )
     model.requires_grad_(False)
     with torch.random.fork_rng(devices=[]):  # the weights are drawn on the CPU, then moved
