@@ -80,13 +80,13 @@ def measure_anchors(
             grpo = GrpoLearner(model, learner.with_values(kl=kl, learning_rate=0.0), rollout, seed=0)
             device = device_of(model)
             with (
-                clocked(grpo.terms, "objective", device=device) as forward,
-                clocked(grpo.terms, "kl", device=device) as kl_spent,
+                clocked(grpo.terms, "compute", device=device) as terms,
+                clocked(grpo.terms, "kl", device=device) as kl_alone,
                 clocked(torch.Tensor, "backward", device=device) as backward,
             ):
                 grpo.train(buffer)
-            for part, spent in zip(PARTS, (forward, kl_spent, backward), strict=True):
-                times[anchor][part].append(spent[0])
+            for part, spent in zip(PARTS, (terms[0] - kl_alone[0], kl_alone[0], backward[0]), strict=True):
+                times[anchor][part].append(spent)
     weights = sum(p.nbytes for p in model.parameters())
     kept = {"buffer": buffer.rollout.zeta.nbytes + buffer.rollout.mask.nbytes, "frozen": weights}
     kept["dual"] = kept["buffer"] + weights

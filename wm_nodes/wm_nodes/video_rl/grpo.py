@@ -41,7 +41,7 @@ MAX_SKIPPED = 5
 class UpdateReport:
     """One optimizer step; see docs/metrics.md.
 
-    With objective nft there is no ratio: it and the clips are NaN, as is the KL without an anchor.
+    With objective nft there is no ratio: it and the clips are NaN.
     """
 
     objective: float
@@ -196,12 +196,10 @@ class GrpoLearner:
         own = self.ranks.share(torch.arange(total))
         for index in torch.split(own, self.settings.micro_batch):  # type: ignore[no-untyped-call]
             part = rows.part(index)
-            current: Any = self.terms.objective(buffer, part, signals[part.videos.to(device)], self.version)
-            kl = self.terms.kl(current, buffer, part, self.version)
-            loss = (self.settings.kl.beta * kl - current.objective).sum() / total
-            loss.backward()
-            sums[0] += current.objective.detach().sum().double()
-            sums[1:] += self.terms.sums(current, kl)
+            terms = self.terms.compute(buffer, part, signals[part.videos.to(device)], self.version)
+            loss = (self.settings.kl.beta * terms.kl - terms.objective).sum() / total
+            loss.backward()  # type: ignore[no-untyped-call]
+            sums += terms.sums(self.settings.clip)
         values = sums.cpu()  # the only wait for the device
         self.ranks.sum_(values)
         return dict(zip(SUMS, values.tolist(), strict=True))

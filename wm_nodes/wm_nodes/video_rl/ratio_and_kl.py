@@ -42,17 +42,25 @@ class Rows:
         return stored[index[0], index[1]]
 
 
-class Pass(NamedTuple):
-    """One pass of the current weights."""
+class LossTerms(NamedTuple):
+    """What the loss is made of, (M,), with gradient."""
 
     objective: Tensor
-    """(M,), with gradient."""
-    new: GaussianTransition
-    """With gradient."""
-    old_zeta: Tensor
-    """Of the rollout, (M, U)."""
-    log_ratio: Tensor
-    """(M,), with gradient."""
+    """To be maximised."""
+    kl: Tensor
+    """To the anchor; 0 where it has no weight."""
+    log_ratio: Tensor | None
+    """Of DD-15; None with objective nft."""
+
+    def sums(self, clip: float) -> Tensor:
+        """Return the sums of objective, kl and ratio, and the counts of ratios beyond either clip, float64 (5,); NaN
+        where there is no ratio."""
+        sums = torch.full((5,), torch.nan, dtype=torch.float64, device=self.kl.device)
+        sums[0], sums[1] = self.objective.detach().sum().double(), self.kl.detach().sum().double()
+        if self.log_ratio is not None:
+            ratio = self.log_ratio.detach()
+            sums[2:] = torch.stack([ratio.exp().sum().double(), *clip_tails(ratio, clip)])
+        return sums
 
 
 class Anchored:
@@ -110,30 +118,31 @@ class GrpoTerms(Anchored):
             iteration=buffer.iteration,
         )
 
-    def objective(self, buffer: RolloutBuffer, rows: Rows, signals_M: Tensor, version: int) -> Pass:
-        """Run the current weights; return DD-16 of DD-15. signals_M: the advantages."""
+    def compute(self, buffer: RolloutBuffer, rows: Rows, signals_M: Tensor, version: int) -> LossTerms:
+        """Run the current weights; return DD-16 of DD-15, and the KL.
+
+        Args:
+            signals_M: the advantages. version: optimizer steps made, for the dual anchor.
+        """
         new = self._transition(self.model, buffer, rows)
         old_zeta = rows.of(buffer.rollout.zeta).flatten(1).float().to(new.zeta.device)
         ratio = self._log_ratio(new, old_zeta)
-        return Pass(clipped_objective(ratio, signals_M, self.settings.clip), new, old_zeta, ratio)
+        objective = clipped_objective(ratio, signals_M, self.settings.clip)
+        return LossTerms(objective, self.kl(new, old_zeta, buffer, rows, version), ratio)
 
-    def kl(self, current: Pass, buffer: RolloutBuffer, rows: Rows, version: int) -> Tensor:
-        """Return DD-17 or DD-20 per transition, (M,). version: optimizer steps made, for the dual anchor."""
-        settings, kl = self.settings.kl, torch.zeros_like(current.log_ratio)
+    def kl(
+        self, new: GaussianTransition, old_zeta: Tensor, buffer: RolloutBuffer, rows: Rows, version: int
+    ) -> Tensor:
+        """Return DD-17 or DD-20 per transition, (M,). old_zeta: of the rollout, (M, U)."""
+        settings, kl = self.settings.kl, torch.zeros(len(rows), device=old_zeta.device)
         if settings.beta == 0:
             return kl
         if settings.anchor in ("buffer", "dual"):
-            kl = kl + self._distance(current.new, current.old_zeta)
+            kl = kl + self._distance(new, old_zeta)
         due = settings.anchor in ("frozen", "lora_off") or version % settings.dual_every == 0
         if settings.anchor != "buffer" and due:
-            kl = kl + self._distance(current.new, self._anchor_zeta(buffer, rows))
+            kl = kl + self._distance(new, self._anchor_zeta(buffer, rows))
         return kl
-
-    def sums(self, current: Pass, kl: Tensor) -> Tensor:
-        """Return the sums of kl and ratio, and the counts of ratios beyond either clip, float64 (4,)."""
-        ratio = current.log_ratio.detach()
-        tails = clip_tails(ratio, self.settings.clip)
-        return torch.stack([kl.detach().sum().double(), ratio.exp().sum().double(), *tails])
 
     # internals
 
