@@ -208,7 +208,7 @@ def repeated(buffer: RolloutBuffer, times: int) -> RolloutBuffer:
     index = torch.arange(len(buffer)).repeat(times)
     return replace(
         buffer, rollout=buffer.rollout.rows(index), condition=buffer.condition.rows(index),
-        group_ids=buffer.group_ids[index], sample_ids=buffer.sample_ids[index], valid=buffer.valid[index],
+        group_ids=buffer.group_ids[index], sample_ids=buffer.sample_ids[index],
         rewards={name: values[index] for name, values in buffer.rewards.items()},
     )
 

@@ -346,8 +346,7 @@ def rollout_of(
     seeds = torch.arange(N) + 100 * iteration
     videos = sample_videos(model, rows, initial_noise(tuple(NOISE.shape[1:]), seeds), seeds, settings)
     unrewarded = RolloutBuffer(
-        videos, rows, torch.tensor([0, 0, 1, 1]), torch.arange(N), {}, torch.zeros(N, dtype=torch.bool), version,
-        iteration, config_hash(settings),
+        videos, rows, torch.tensor([0, 0, 1, 1]), torch.arange(N), {}, version, iteration, config_hash(settings),
     )
     return unrewarded.with_rewards({"brightness": videos.latents.mean((1, 2, 3, 4))})
 

@@ -33,7 +33,7 @@ from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import WeightsError
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError, StepContext, VideoNetwork, step
 from wm_nodes.video_rl.group_advantages import GroupAdvantages
-from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner, mixed_reward
+from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner
 from wm_nodes.video_rl.grpo_math import gaussian_logprob
 from wm_nodes.video_rl.ratio_and_kl import Rows
 
@@ -62,7 +62,7 @@ def all_rows(buffer: RolloutBuffer) -> Rows:
 
 
 def known(values: list[float]) -> GroupAdvantages:
-    return GroupAdvantages(torch.tensor(values, dtype=torch.float64), torch.ones(len(values)).bool(), 1, 0)
+    return GroupAdvantages(torch.tensor(values, dtype=torch.float64), torch.ones(len(values)).bool(), 1, 0, 0)
 
 
 SIGNAL = known([1.5, -0.5, 0.25, -1.0, 2.0, -2.0, 0.1, 0.7])
@@ -446,18 +446,6 @@ def test_best_of_2_trains_the_best_and_the_worst_video_of_each_group() -> None:
     assert report.advantage_abs_mean == pytest.approx((1.5 / math.sqrt(1.25) + 2 / math.sqrt(2.5)) / 2)
 
 
-def test_the_reward_that_trains_is_the_total_or_the_only_one() -> None:
-    buffer = buffer_of(make())
-    ones, twos = torch.ones(8), 2 * torch.ones(8)
-    assert mixed_reward(buffer.with_rewards({"a": ones})).tolist() == [1.0] * 8
-    assert mixed_reward(buffer.with_rewards({"a": ones, "total": twos})).tolist() == [2.0] * 8
-    for rewards, named in (({}, "(none)"), ({"a": ones, "b": twos}, "a, b")):
-        with pytest.raises(
-            ValueError, match=f"holds rewards {named.replace('(', '[(]').replace(')', '[)]')} and no `total`"
-        ):
-            mixed_reward(buffer.with_rewards(rewards))
-
-
 @pytest.mark.parametrize("arm", ["cps", "dyndiff", "flow"])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_updates_move_new_videos_towards_what_is_rewarded(arm: str, sign: int) -> None:
@@ -605,15 +593,6 @@ def test_a_buffer_without_a_group_of_valid_rewards_is_one_clear_error(rewards: l
         train_on(learner, rewards)
     assert_equal(before, weights(learner.model))
     assert learner.version == 0
-
-
-def test_a_reward_that_is_marked_valid_and_not_finite_is_an_error_however_many_were_skipped() -> None:
-    learner = make()
-    buffer = buffer_of(learner)
-    broken = replace(buffer, rewards={"total": torch.tensor([math.inf] + [0.7] * 7).double()})
-    with pytest.raises(ValueError, match="reward of video 0 is inf; mark it valid=False"):
-        learner.train(broken)
-    assert learner.version == learner.skipped == 0
 
 
 @pytest.mark.parametrize(("rewards", "few", "invalid"), [(EQUAL, 0, 0), ([1.0] * 4 + [math.nan] * 3 + [2.0], 1, 3)])

@@ -23,15 +23,11 @@ M, U = 3, 8192
 EPS = 1e-4
 
 
-def advantages(rewards: list[float], groups: list[int] | None = None, valid: list[int] | None = None,
-               clip: float = 2.5, **options: object) -> GroupAdvantages:
-    return group_advantages(
-        torch.tensor(rewards, dtype=torch.float64),
-        torch.tensor(groups or [0] * len(rewards)),
-        torch.tensor(valid or [1] * len(rewards), dtype=torch.bool),
-        clip=clip,
-        **options,  # type: ignore[arg-type]
-    )
+def advantages(
+    rewards: list[float], groups: list[int] | None = None, clip: float = 2.5, **options: object
+) -> GroupAdvantages:
+    of = torch.tensor(groups or [0] * len(rewards))
+    return group_advantages(torch.tensor(rewards, dtype=torch.float64), of, clip=clip, **options)  # type: ignore[arg-type]
 
 
 def gaussians() -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -78,7 +74,7 @@ def test_before_the_clip_every_group_has_mean_zero_and_deviation_one_and_the_cli
 def test_equal_float32_rewards_of_0_7_have_no_advantage_at_all(size: int) -> None:
     """The usual float32 form gives up to 0.89."""
     rewards = torch.full((size,), 0.7)
-    found = group_advantages(rewards, torch.zeros(size), torch.ones(size), clip=2.5)
+    found = group_advantages(rewards, torch.zeros(size), clip=2.5)
     assert not found.advantages_N.any() and not found.kept_N.any() and found.num_zero_std == 1
 
 
@@ -96,29 +92,26 @@ def test_the_largest_advantage_of_a_group_is_the_root_of_its_size_less_one() -> 
         assert float(found[0]) == pytest.approx(high)
 
 
-def test_invalid_videos_count_in_no_statistic_and_do_not_train() -> None:
-    found = advantages([1, math.nan, 3, 500], valid=[1, 0, 1, 0])
+def test_videos_without_a_reward_count_in_no_statistic_and_do_not_train() -> None:
+    found = advantages([1, math.nan, 3, math.inf])
     assert_close(found.advantages_N, torch.tensor([-1.0, 0, 1, 0], dtype=torch.float64))
     assert found.kept_N.tolist() == [True, False, True, False]
 
 
-def test_a_group_with_fewer_than_two_valid_videos_has_no_spread() -> None:
-    found = advantages([1, 2, 3, 5, 6, 7], [0, 0, 0, 1, 1, 2], [1, 0, 0, 0, 0, 1])
-    assert not found.kept_N.any() and not found.advantages_N.any()
-    assert (found.num_groups, found.num_zero_std) == (3, 3)
+def test_a_group_trains_with_two_rewards_and_with_half_of_its_videos() -> None:
+    """RA-15: two of four and three of five do, two of five and one of two do not."""
+    nan = math.nan
+    rewards = [1, 3, nan, nan, 1, 2, 3, nan, nan, 1, 2, nan, nan, nan, 5, nan]
+    found = advantages(rewards, [0] * 4 + [1] * 5 + [2] * 5 + [3] * 2)
+    assert found.kept_N.nonzero().flatten().tolist() == [0, 1, 4, 5, 6]
+    assert (found.num_groups, found.num_dropped, found.num_zero_std) == (4, 2, 2)
+    assert not found.advantages_N[9:].any()
 
 
 def test_a_global_deviation_is_that_of_all_groups_about_their_own_means() -> None:
     """Deviations (-1, 1) and (-3, 3): the mean square is 5."""
     found = advantages([0, 2, 10, 16], [0, 0, 1, 1], std_scope="global").advantages_N
     assert_close(found, torch.tensor([-1.0, 1, -3, 3], dtype=torch.float64) / math.sqrt(5))
-
-
-def test_a_valid_reward_that_is_not_finite_is_an_error_that_names_the_video() -> None:
-    with pytest.raises(ValueError, match="reward of video 2 is nan"):
-        advantages([1, math.nan, math.nan], valid=[1, 0, 1])
-    with pytest.raises(ValueError, match="one shape"):
-        group_advantages(torch.zeros(3), torch.zeros(2), torch.ones(3), clip=1.0)
 
 
 # best of N

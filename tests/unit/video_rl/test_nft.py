@@ -62,7 +62,7 @@ def buffer_of(learner: GrpoLearner, **changes: Any) -> RolloutBuffer:
 
 
 def signal(values: list[float]) -> GroupAdvantages:
-    return GroupAdvantages(torch.tensor(values, dtype=torch.float64), torch.ones(len(values)).bool(), 1, 0)
+    return GroupAdvantages(torch.tensor(values, dtype=torch.float64), torch.ones(len(values)).bool(), 1, 0, 0)
 
 
 def all_rows(count: int, times: int = 3) -> Rows:

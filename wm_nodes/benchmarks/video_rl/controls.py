@@ -17,7 +17,7 @@ from wm_nodes.config.video import GrpoConfig, RolloutConfig
 from wm_nodes.core.device import device_of
 from wm_nodes.video_model import RolloutBuffer, VideoNetwork, VideoRollout, config_hash
 from wm_nodes.video_model.flow_matching import flow_matching_loss
-from wm_nodes.video_rl.grpo import BufferReport, UpdateReport, mixed_reward
+from wm_nodes.video_rl.grpo import BufferReport, UpdateReport
 from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
 
 TRAINING_CALLS = 3
@@ -60,7 +60,7 @@ class FlowMatchingLearner:
         rows = torch.nonzero(kept_clips(buffer, self.keep))[:, 0]
         updates = tuple(self._update(buffer, rows) for _ in range(self.settings.updates_per_buffer))
         self.iterations += 1
-        rewards = mixed_reward(buffer)
+        rewards = buffer.reward
         groups = len(set(buffer.group_ids.tolist()))
         return BufferReport(
             updates=updates, reward_mean=float(rewards[buffer.valid].mean()), advantage_abs_mean=NAN,
@@ -92,8 +92,8 @@ class FlowMatchingLearner:
 def kept_clips(buffer: RolloutBuffer, keep: Kept) -> Tensor:
     """Return which clips train, bool (N,): the valid ones, or of each group the valid one of highest reward."""
     if keep == "all":
-        return buffer.valid.clone()
-    rewards = torch.where(buffer.valid, mixed_reward(buffer), -torch.inf)
+        return buffer.valid
+    rewards = torch.where(buffer.valid, buffer.reward, -torch.inf)
     kept = torch.zeros_like(buffer.valid)
     for group in set(buffer.group_ids.tolist()):
         rows = torch.nonzero(buffer.group_ids == group)[:, 0]
@@ -122,8 +122,8 @@ class RecordedTargets(RecordedContexts):
         )
         rows = torch.arange(N)
         return RolloutBuffer(
-            rollout, condition, rows, torch.zeros_like(rows), {}, torch.ones(N, dtype=torch.bool),
-            request.policy_version, request.iteration, config_hash(settings),
+            rollout, condition, rows, torch.zeros_like(rows), {}, request.policy_version, request.iteration,
+            config_hash(settings),
         )
 
     def score(self, request: GroupRequest, clips: RolloutBuffer) -> RolloutBuffer:

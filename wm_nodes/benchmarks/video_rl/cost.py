@@ -162,10 +162,7 @@ def pushcube_buffer(seed: int, device: torch.device) -> tuple[VideoNetwork, tupl
     noise = sampling.initial_noise(shape, index + seed).to(device)
     videos = sampling.sample_videos(network, condition, noise, index + seed, rollout)
     rewards = torch.rand(len(index), generator=torch_stream(seed, "cost_rewards"), dtype=torch.float64)
-    buffer = RolloutBuffer(
-        videos, condition, index // GROUP, index % GROUP, {}, torch.ones(len(index), dtype=torch.bool), 0, 0,
-        config_hash(rollout),
-    )
+    buffer = RolloutBuffer(videos, condition, index // GROUP, index % GROUP, {}, 0, 0, config_hash(rollout))
     return network, (buffer.with_rewards({"total": rewards}), rollout)
 
 

@@ -54,7 +54,7 @@ class DiscSource(ToyContexts):
 
     def measure(self, buffer: RolloutBuffer) -> dict[str, float]:
         """group_spread, and the largest |A| of DD-13 before it is clipped."""
-        unclipped = group_advantages(buffer.rewards["total"], buffer.group_ids, buffer.valid, clip=math.inf)
+        unclipped = group_advantages(buffer.rewards["total"], buffer.group_ids, clip=math.inf)
         largest = float(unclipped.advantages_N.abs().max())
         return {**group_spread(buffer, self.config.groups.group_size), "advantage_max": largest}
 

@@ -1,5 +1,6 @@
 """Check a video model before GRPO trains it: ratio, KL, ODE step, mask, buffer and memory, a line each; of an embedded
-one what the best clip of a group is better by than the others, clip after clip on its own frames.
+one what the best clip of a group is better by than the others, clip after clip on its own frames: where that closes
+little of the gap to the codec, no group method can learn.
 
     wm check-video-model [--video-model FOLDER --context-bags BAG ... | --public FOLDER]
 """
@@ -82,12 +83,14 @@ def _print_headroom(
     drift = {name: float(values.mean()) for name, values in horizon_scores(frames, clips, probe, folder).items()}
     columns = (
         "clip", "reward", "best of n", "gain", "object, cm less", "tool, cm less", "std in a group", "codec",
+        "of the gap, at most",
         *(f"rollout {name}" for name in DRIFT),
     )
     rows = (
         (
             str(h.clips), f"{h.reward:.3f}", f"{h.best:.3f}", estimate(h.gain, ".3f"), estimate(h.object_cm, ".2f"),
             estimate(h.tool_cm, ".2f"), f"{h.spread:.3f}", f"{h.codec:.3f}",
+            f"{h.share:.0%}",
             *(f"{drift[f'{name}_{h.clips}']:.2f}" for name in DRIFT),
         )
         for h in found
@@ -95,7 +98,6 @@ def _print_headroom(
     n = config.groups.group_size
     title = f"best of {n} clips against the mean, {len(clips)} contexts, 95 % bootstrap interval over them"
     console.print(make_table(title, columns, rows, left=()))
-    console.print(*(h.text() for h in found), sep="\n", highlight=False)
 
 
 def _recorded(arguments: argparse.Namespace, config: VideoRlConfig) -> tuple[VideoFolder, Clips] | None:

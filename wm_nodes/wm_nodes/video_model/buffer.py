@@ -49,8 +49,6 @@ class RolloutBuffer:
     """Place in the group, int64 (N,)."""
     rewards: Mapping[str, Tensor]
     """Raw values by name, float64 (N,), NaN where missing."""
-    valid: Tensor
-    """bool (N,), False where any reward is missing or was refused."""
     policy_version: int
     """Optimizer steps of the weights that sampled."""
     iteration: int
@@ -61,12 +59,26 @@ class RolloutBuffer:
     def __len__(self) -> int:
         return len(self.group_ids)
 
+    @property
+    def reward(self) -> Tensor:
+        """The reward that trains, float64 (N,): `total`, or the only one. Raises ValueError: there is neither."""
+        if "total" not in self.rewards and len(self.rewards) != 1:
+            raise ValueError(
+                f"the buffer holds rewards {', '.join(self.rewards) or '(none)'} and no `total`; mix them first"
+            )
+        return self.rewards["total"] if "total" in self.rewards else next(iter(self.rewards.values()))
+
+    @property
+    def valid(self) -> Tensor:
+        """bool (N,), which videos have a reward that trains."""
+        return torch.isfinite(self.reward)
+
     def to(self, device: torch.device | str) -> "RolloutBuffer":
         """The same buffer with its videos and condition on a device."""
         return replace(self, rollout=self.rollout.to(device), condition=self.condition.to(device))
 
     def with_rewards(self, rewards: Mapping[str, Tensor]) -> "RolloutBuffer":
-        """The same videos with rewards, from any device; a video is valid while all of its rewards are finite.
+        """The same videos with rewards, from any device.
 
         Raises:
             RolloutBufferError: a reward is not one number per video.
@@ -75,10 +87,7 @@ class RolloutBuffer:
         for name, value in values.items():
             if value.shape != (len(self),):
                 raise RolloutBufferError(f"reward {name} has shape {tuple(value.shape)}, the buffer {len(self)} videos")
-        valid = torch.ones(len(self), dtype=torch.bool)
-        for value in values.values():
-            valid &= torch.isfinite(value)
-        return replace(self, rewards=values, valid=valid)
+        return replace(self, rewards=values)
 
     def check(self, settings: RolloutConfig, policy_version: int) -> None:
         """Raise RolloutBufferError if the buffer was sampled with other settings, or by other weights."""
@@ -130,7 +139,6 @@ class RolloutBuffer:
                 group_ids=tensors["group_ids"],
                 sample_ids=tensors["sample_ids"],
                 rewards={name.removeprefix("reward."): tensors[name] for name in rewards},
-                valid=tensors["valid"],
                 policy_version=header["policy_version"],
                 iteration=header["iteration"],
                 config_hash=header["config_hash"],
@@ -144,7 +152,7 @@ class RolloutBuffer:
         tensors = {f"rollout.{name}": getattr(self.rollout, name) for name in _ROLLOUT_TENSORS}
         tensors |= {f"condition.{name}": getattr(self.condition, name) for name in ("frames", "actions", "text")}
         tensors |= {f"reward.{name}": value for name, value in self.rewards.items()}
-        tensors |= {"group_ids": self.group_ids, "sample_ids": self.sample_ids, "valid": self.valid}
+        tensors |= {"group_ids": self.group_ids, "sample_ids": self.sample_ids}
         return {name: tensor.contiguous() for name, tensor in tensors.items()}
 
 

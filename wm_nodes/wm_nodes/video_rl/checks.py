@@ -191,7 +191,5 @@ def _check_first_update(learner: GrpoLearner, buffer: RolloutBuffer) -> tuple[Ch
 
 def _make_buffer(sampled: VideoRollout, condition: Condition, rollout: RolloutConfig) -> RolloutBuffer:
     count = len(sampled.latents)
-    return RolloutBuffer(
-        sampled, condition, torch.zeros(count, dtype=torch.int64), torch.arange(count), {},
-        torch.ones(count, dtype=torch.bool), 0, 0, config_hash(rollout),
-    )
+    group = torch.zeros(count, dtype=torch.int64)
+    return RolloutBuffer(sampled, condition, group, torch.arange(count), {}, 0, 0, config_hash(rollout))

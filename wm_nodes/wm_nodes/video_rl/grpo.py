@@ -28,7 +28,7 @@ from wm_nodes.training import checkpoint
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import WeightsError, check_same_layout
 from wm_nodes.video_model.buffer import RolloutBuffer
-from wm_nodes.video_rl.group_advantages import GroupAdvantages, best_of_n, group_advantages, trainable
+from wm_nodes.video_rl.group_advantages import GroupAdvantages, best_of_n, group_advantages
 from wm_nodes.video_rl.nft import NftTerms
 from wm_nodes.video_rl.ratio_and_kl import GrpoTerms, Rows
 
@@ -77,7 +77,7 @@ class BufferReport:
     skipped: int
     """Buffers without updates in a row, up to this one."""
     dropped_groups: int
-    """Those with fewer valid videos than trainable() asks for; they are in zero_std_ratio too."""
+    """Those with too few rewards (RA-15); they are in zero_std_ratio too."""
     kept: int
     """Videos that train."""
     group_size: float
@@ -129,8 +129,8 @@ class GrpoLearner:
 
         Raises:
             RolloutBufferError: another sampler configuration, or other weights.
-            ValueError: a reward that is marked valid and not finite, no group with enough valid ones, MAX_SKIPPED
-                buffers in a row without spread, or no generated frame.
+            ValueError: no group with enough finite rewards, MAX_SKIPPED buffers in a row without spread, or no
+                generated frame.
             FloatingPointError: a loss or gradient is not finite.
         """
         buffer.check(self.rollout, self.version)
@@ -139,17 +139,13 @@ class GrpoLearner:
                 f"all {buffer.rollout.latents.shape[2]} frames of these videos are given: nothing was generated that "
                 f"could be learned from; give fewer"
             )
-        rewards, before = mixed_reward(buffer), self._snapshot()
-        trains = torch.from_numpy(trainable(buffer.valid.numpy(), buffer.group_ids.numpy()))
+        rewards, valid, before = buffer.reward, buffer.valid, self._snapshot()
         settings = self.settings.advantage
-        advantages = group_advantages(
-            rewards, buffer.group_ids, trains, clip=settings.clip, std_scope=settings.std_scope
-        )
-        invalid = int((~buffer.valid).sum())
-        dropped = advantages.num_groups - len(set(buffer.group_ids[trains].tolist()))
+        advantages = group_advantages(rewards, buffer.group_ids, clip=settings.clip, std_scope=settings.std_scope)
+        invalid, dropped = int((~valid).sum()), advantages.num_dropped
         kept = best_of_n(advantages.advantages_N, buffer.group_ids, advantages.kept_N, settings.best_of_n)
         skipped = 0 if bool(kept.any()) else self.skipped + 1
-        if not bool(trains.any()) or skipped >= MAX_SKIPPED:
+        if dropped == advantages.num_groups or skipped >= MAX_SKIPPED:
             raise ValueError(
                 f"nothing to learn from: {invalid} of {len(buffer)} rewards are invalid, {dropped} of "
                 f"{advantages.num_groups} groups have too few valid ones and {advantages.num_zero_std - dropped} no "
@@ -168,7 +164,7 @@ class GrpoLearner:
         self.iterations += 1
         return BufferReport(
             updates=updates,
-            reward_mean=float(rewards[buffer.valid].mean()),
+            reward_mean=float(rewards[valid].mean()),
             advantage_abs_mean=float(advantages.advantages_N[kept].abs().mean()),
             zero_std_ratio=advantages.num_zero_std / advantages.num_groups,
             invalid=invalid,
@@ -292,15 +288,6 @@ def _train_condition(model: nn.Module) -> None:
     model.requires_grad_(False)
     for parameter in condition_parameters():
         parameter.requires_grad_(True)
-
-
-def mixed_reward(buffer: RolloutBuffer) -> Tensor:
-    """Return the reward that trains, float64 (N,): the buffer's `total`, or its only reward."""
-    if "total" in buffer.rewards:
-        return buffer.rewards["total"]
-    if len(buffer.rewards) == 1:
-        return next(iter(buffer.rewards.values()))
-    raise ValueError(f"the buffer holds rewards {', '.join(buffer.rewards) or '(none)'} and no `total`; mix them first")
 
 
 def _trained_parameters(model: nn.Module) -> Iterator[tuple[str, Tensor]]:

@@ -16,9 +16,6 @@ from wm_nodes.video_rl.reference_reward import mix_rewards, score_clips
 from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
 from wm_nodes.world_model.position_probe import PositionProbe
 
-LEAST_SHARE = 0.1
-"""A group whose best clip closes less than this share of the gap between a clip's reward and that of a recording seen
-through the codec has nothing to teach: the number is a judgement, not a theorem."""
 DRIFT = ("tool_cm", "object_cm", "psnr_db")
 Interval = tuple[float, float, float]
 """Mean over contexts and its 95 % bootstrap interval."""
@@ -50,21 +47,6 @@ class Headroom:
         """The part of the gap to the codec that the best of a group closes, by the upper end of its interval."""
         gap = self.codec - self.reward
         return self.gain[2] / gap if gap > 0 else 0.0
-
-    @property
-    def can_learn(self) -> bool:
-        return self.share >= LEAST_SHARE
-
-    def text(self) -> str:
-        """One sentence."""
-        if self.codec <= self.reward:
-            return f"clip {self.clips}: as good as the codec allows; nothing is left to learn"
-        if self.can_learn:
-            return f"clip {self.clips}: the best of a group closes up to {self.share:.0%} of the gap to the codec"
-        return (
-            f"clip {self.clips}: no group method can learn here: the best of a group closes at most {self.share:.1%} "
-            f"of the gap to the codec (below {LEAST_SHARE:.0%}); add noise, or train on recordings"
-        )
 
 
 def measure_headroom(

@@ -80,10 +80,7 @@ def sample_buffer(
     with explain_memory(device, rollout__micro_batch=settings.micro_batch, groups__contexts=config.groups.contexts):
         rollout = sample_videos(network, condition, noise.to(device), seeds, settings, steps, on_progress)
     condition = condition.to(rollout.latents.device)
-    valid = torch.ones(len(groups), dtype=torch.bool)
-    return RolloutBuffer(
-        rollout, condition, groups, samples, {}, valid, policy_version, iteration, config_hash(settings)
-    )
+    return RolloutBuffer(rollout, condition, groups, samples, {}, policy_version, iteration, config_hash(settings))
 
 
 class ClipGenerator:
