@@ -42,6 +42,13 @@ def test_every_row_and_every_decimal_number_of_a_result_page_stands_in_its_full_
     assert set(DECIMAL.findall(quoted)) <= set(DECIMAL.findall(full))
 
 
+def test_a_result_page_asks_at_most_four_questions_and_answers_each_in_at_most_five_rows() -> None:
+    for page in (DOCS / "results").glob("*.md"):
+        _, *questions = page.read_text().split("\n## ")
+        assert len(questions) <= 4, page
+        assert not [part for part in questions if not part.splitlines()[0].endswith("?") or len(rows(part)) > 5]
+
+
 def rows(text: str) -> list[list[str]]:
     """The cells of all rows of all tables below their heads."""
     body = re.sub(r"^\|.*\|\n\|[ |-]*\|$", "", text, flags=re.MULTILINE)

@@ -2,11 +2,9 @@
 
 from benchmarks.tables.table import Rows, percent, read, share
 
-HACKED = ("judge_hack.json", "judge_hack_scenes.json")
-
 
 def hacked() -> Rows:
-    both = [read(name)["counts"] for name in HACKED]
+    both = [read(f"judge_hack{of}.json")["counts"] for of in ("", "_scenes")]
     for pattern in ("occlusion", "motion", "background", "physics", "benign"):
         steps = (1, 2, 3, 4) if pattern == "benign" else (3, 4)
         for edit in ("all", *sorted({one["edit"] for one in both[0] if one["pattern"] == pattern})):

@@ -36,16 +36,14 @@ def section(
     return "\n".join([*text, *[about, ""] * bool(about), *sources, ""])
 
 
-def read(name: str) -> Run:
-    content: Run = json.loads((FILES / name).read_text(encoding="utf-8"))
-    return content
-
-
 def lines(name: str) -> list[Run]:
     """The runs of a .jsonl file; of another file its content alone."""
-    if not name.endswith(".jsonl"):
-        return [read(name)]
-    return [json.loads(line) for line in (FILES / name).read_text(encoding="utf-8").splitlines()]
+    text = (FILES / name).read_text(encoding="utf-8")
+    return [json.loads(part) for part in (text.splitlines() if name.endswith(".jsonl") else [text])]
+
+
+def read(name: str) -> Run:
+    return lines(name)[0]
 
 
 def runs(name: str) -> dict[str, Run]:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from itertools import groupby
 from statistics import mean, median
 
-from benchmarks.tables.table import Rows, Run, interval, lines, percent, read, runs
+from benchmarks.tables.table import Rows, Run, interval, lines, percent, read
 from benchmarks.video_rl.comparison import gains, paired_interval
 from wm_nodes.core.statistics import bootstrap_mean
 
@@ -85,7 +85,7 @@ def clip_learning() -> Rows:
 
 
 def cost() -> Rows:
-    three = list(runs("video_rl_cost.jsonl").values())
+    three = lines("video_rl_cost.jsonl")
     for same in zip(*(run["rows"] for run in three), strict=True):
         model = same[0]["model"]
         shares = (one["kl_s"] / (one["forward_s"] + one["kl_s"] + one["backward_s"]) for one in same)

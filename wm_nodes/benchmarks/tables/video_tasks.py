@@ -3,7 +3,7 @@
 import math
 from statistics import mean, variance
 
-from benchmarks.tables.table import Rows, Run, interval, percent, points, read, runs
+from benchmarks.tables.table import Rows, Run, interval, lines, percent, points, read, runs
 from benchmarks.tables.video_rl import gained, over_seeds, samplers
 from benchmarks.video_rl.comparison import compare_samplers
 
@@ -80,7 +80,7 @@ def closed_loop() -> Rows:
 
 
 def closed_loop_trainings() -> dict[str, list[Run]]:
-    return samplers([one for run in runs(CLOSED_LOOP).values() for one in run["rows"]])
+    return samplers([one for run in lines(CLOSED_LOOP) for one in run["rows"]])
 
 
 def by_clip() -> Rows:
