@@ -68,12 +68,11 @@ def test_every_result_file_is_linked_from_a_page_and_every_relative_link_of_a_do
 
 
 def words(*pages: Path) -> int:
-    """Words and numbers of the pages; a table's bars and dashes are none."""
+    """Words and numbers of hand-written pages, which the full tables are not; a table's bars and dashes are none."""
     return sum(len(re.findall(r"\S*\w\S*", page.read_text())) for page in pages)
 
 
 def test_documents_are_short() -> None:
-    """The full tables are no hand-written documents."""
     results, guides = sorted((DOCS / "results").glob("*.md")), [DOCS / f"{name}.md" for name in GUIDES]
     assert not [page.name for page in results if words(page) > 500]
     assert words(*results) <= 2800

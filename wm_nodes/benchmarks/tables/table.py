@@ -13,8 +13,7 @@ from wm_nodes.core.statistics import paired_difference, wilson_interval
 
 ROOT = Path(wm_nodes.__file__).parents[1]
 DOCS, FILES = ROOT / "docs", ROOT / "benchmarks" / "results"
-PRETRAINED = "../../wm_nodes/pretrained"
-"""The shipped models, seen from the result files."""
+PRETRAINED = "../../wm_nodes/pretrained"  # seen from the result files
 LONG_PATHS = re.compile(r"(?<!\S)(?:(?:/\S*|\S*shard_\S*|\.\.\.)\s*)+")
 BY_HAND = "- By hand, from reports of runs that are not in the repository"
 Run = dict[str, Any]

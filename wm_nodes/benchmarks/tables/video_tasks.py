@@ -16,8 +16,7 @@ UNPAID = (
     ("impossible_tool_steps", 3),
 )
 ACCEPTED = ("accepted", "accepted_executed")
-T_10 = 2.228
-"""97.5 % quantile of Student's t for 10 degrees of freedom."""
+T_10 = 2.228  # 97.5 % quantile of Student's t for 10 degrees of freedom
 
 
 def outcome() -> Rows:
