@@ -404,11 +404,11 @@ def test_a_run_folder_of_ode_clips_resumes_and_writes_null_for_what_does_not_exi
 
 
 def test_the_check_of_a_video_model_finds_no_ratio_and_equal_calls() -> None:
-    config, network = nft_config(), tiny_network()
+    config, network = load_video_config("base").with_values(rollout=ODE, grpo=nft_config()), tiny_network()
     buffer = toy_buffer(network, ODE)
-    found = {f.name: f for f in examine(network, buffer.condition, SHAPE, ODE, config)}
+    found = {f.name: f for f in examine(network, buffer.condition, SHAPE, config)}
     assert all(finding.passed for finding in found.values())
     assert found["ratio is 1 on the first update"].value == "objective nft has none"
     restless = Analytic(lambda x, t: x + 0.3 * torch.randn_like(x))  # other noise on every call, as dropout would give
-    found = {f.name: f for f in examine(restless, buffer.condition, SHAPE, ODE, config)}
+    found = {f.name: f for f in examine(restless, buffer.condition, SHAPE, config)}
     assert not found["KL is 0 at the anchor"].passed

@@ -57,10 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
     config = load_video_config(arguments.preset, settings(arguments))
     recorded = _recorded(arguments, config)
     model, condition, shape, config = _model_to_check(arguments, config, recorded)
-    videos = config.groups.contexts * config.groups.group_size
-    findings = examine(
-        model, condition, shape, config.rollout, config.grpo, seed=config.seed, buffer_videos=videos
-    )
+    findings = examine(model, condition, shape, config)
     title = f"{len(condition.actions)} videos of {' x '.join(map(str, shape))} latents (C x F x H x W)"
     columns = ("check", "", "found", "where it failed")
     marks = {True: "[green]passed", False: "[red]FAILED"}
