@@ -97,16 +97,16 @@ def validation_scores(
     return scores
 
 
-def find_hacked_now(lines: Sequence[Mapping[str, object]], window: int) -> list[HackedMetric] | None:
+def find_hacked_now(lines: Sequence[Mapping[str, Any]], window: int) -> list[HackedMetric] | None:
     """Return the metrics that fell over the newest `window` evaluations in lines of metrics.jsonl while the training
     reward rose (DD-2), None while there are fewer evaluations. The reward of an evaluation is the mean of the buffers
     since the one before; slopes are per evaluation, of more_is_better(). Only WATCHED scores are compared.
     """
-    rewards = {_step(line): line["reward_mean"] for line in lines if line["section"] == "grpo"}
-    evaluations = {_step(line): line for line in lines if line["section"] == SECTION}
-    proxy, rows, begin = list[float](), list[Mapping[str, object]](), 0
+    rewards = {line["step"]: line["reward_mean"] for line in lines if line["section"] == "grpo"}
+    evaluations = {line["step"]: line for line in lines if line["section"] == SECTION}
+    proxy, rows, begin = list[float](), list[Mapping[str, Any]](), 0
     for step in sorted(evaluations):
-        since = [float(str(value)) for at, value in rewards.items() if begin < at <= step and value is not None]
+        since = [value for at, value in rewards.items() if begin < at <= step and value is not None]
         begin = step
         if since:
             proxy.append(sum(since) / len(since))
@@ -114,7 +114,7 @@ def find_hacked_now(lines: Sequence[Mapping[str, object]], window: int) -> list[
     if len(proxy) < window:
         return None
     names = [name for name in WATCHED if all(row.get(name) is not None for row in rows)]
-    curves = {name: [float(more_is_better(name, float(str(row[name])))) for row in rows] for name in names}
+    curves = {name: more_is_better(name, [row[name] for row in rows]).tolist() for name in names}
     return find_hacked_metrics(proxy, curves, window=window)
 
 
@@ -128,12 +128,10 @@ def alarm_scalars(alarms: Sequence[HackedMetric] | None) -> dict[str, float]:
     return scalars
 
 
-def alarms_of(line: Mapping[str, object]) -> list[HackedMetric]:
+def alarms_of(line: Mapping[str, Any]) -> list[HackedMetric]:
     """Read the alarms in a line of metrics.jsonl."""
-    return [
-        HackedMetric(name, float(str(line["reward_slope"])), float(str(line[f"hacked_{name}"])))
-        for name in WATCHED if line.get(f"hacked_{name}") is not None
-    ]
+    slopes = {name: line.get(f"hacked_{name}") for name in WATCHED}
+    return [HackedMetric(name, line["reward_slope"], slope) for name, slope in slopes.items() if slope is not None]
 
 
 def alarm_text(alarms: Sequence[HackedMetric]) -> str:
@@ -145,7 +143,3 @@ def alarm_text(alarms: Sequence[HackedMetric]) -> str:
         f"the training reward rises by {alarms[0].proxy_slope:.3g} per evaluation while held-out scores get worse: "
         f"{worse}; weigh them in, or stop earlier"
     )
-
-
-def _step(line: Mapping[str, object]) -> int:
-    return int(str(line["step"]))
