@@ -49,7 +49,6 @@ from wm_nodes.video_model.adapters import (  # noqa: E402
     add_lora,
     load_lora,
     load_public_model,
-    normalised_cfg,
     save_lora,
 )
 from wm_nodes.video_model.kernels import ode_step, with_conditioning  # noqa: E402
@@ -223,7 +222,7 @@ class TestParityWithThePipelines:
             guidance_scale=scale, **CALL,
         )[0]
         model = WanVelocity(pipeline.transformer, NULL[0])
-        ours = follow(model, pipeline.scheduler.sigmas, given(), model.normalised_cfg(scale))
+        ours = follow(model, pipeline.scheduler.sigmas, given(), scale)
         assert_close(ours, theirs, atol=2e-5, rtol=1e-4)
 
     def test_wan_one_euler_step_is_the_schedulers(self) -> None:
@@ -261,7 +260,7 @@ class TestParityWithThePipelines:
         )[0]
         frames = VideoCodec(pipeline.vae).encode(frame) if with_frame else None
         model = CosmosVelocity(pipeline.transformer, NULL[0])
-        ours = follow(model, pipeline.scheduler.sigmas, given(frames), model.normalised_cfg(scale))
+        ours = follow(model, pipeline.scheduler.sigmas, given(frames), 1 + scale)
         assert_close(ours, theirs, atol=5e-5, rtol=1e-4)
 
     def test_cosmos_padding_channel_is_zero_and_needs_no_torchvision(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -290,13 +289,6 @@ class TestParityWithThePipelines:
 
 
 class TestGuidance:
-    def test_both_conventions_give_the_same_guided_velocity(self) -> None:
-        conditional, unconditional = normal(4, seed=1), normal(4, seed=2)
-        ours = normalised_cfg(6.0, "conditional")
-        assert ours == 7.0 and normalised_cfg(7.0, "unconditional") == 7.0
-        theirs = conditional + 6.0 * (conditional - unconditional)
-        assert_close(unconditional + ours * (conditional - unconditional), theirs)
-
     def test_dropped_rows_see_the_negative_prompt_and_others_do_not(self) -> None:
         model = WanVelocity(wan_transformer(), NULL[0])
         x, t, text = NOISE.repeat(2, 1, 1, 1, 1), torch.tensor([0.5, 0.5]), TEXT.repeat(2, 1, 1)

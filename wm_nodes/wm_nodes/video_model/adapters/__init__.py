@@ -17,11 +17,10 @@ from wm_nodes.video_model.adapters.folder import ModelFolder
 from wm_nodes.video_model.adapters.loading import LoadSettings, PublicVideoModel, load_public_model
 from wm_nodes.video_model.adapters.lora import add_lora, load_lora, save_lora
 from wm_nodes.video_model.adapters.text import TextEncoder
-from wm_nodes.video_model.adapters.velocity import PublicVelocity, normalised_cfg
+from wm_nodes.video_model.adapters.velocity import PublicVelocity
 from wm_nodes.video_model.adapters.wan import WanVelocity
 
 __all__ = [
     "CosmosVelocity", "LoadSettings", "MissingPackageError", "ModelFolder", "PublicVelocity", "PublicVideoModel",
-    "TextEncoder", "VideoCodec", "WanVelocity", "add_lora", "load_lora", "load_public_model", "normalised_cfg",
-    "save_lora",
+    "TextEncoder", "VideoCodec", "WanVelocity", "add_lora", "load_lora", "load_public_model", "save_lora",
 ]

@@ -7,12 +7,12 @@ starts at t = 0.995, ours at 1.
 Given frames are clean latents in place, marked in a mask channel and given a time near 0 (CLEAN_TIME).
 """
 
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from wm_nodes.video_model.adapters.velocity import CfgConvention, PublicVelocity
+from wm_nodes.video_model.adapters.velocity import PublicVelocity
 from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.kernels import with_conditioning
 
@@ -21,9 +21,7 @@ CLEAN_TIME = 1e-4
 
 
 class CosmosVelocity(PublicVelocity):
-    """CosmosTransformer3DModel."""
-
-    cfg_convention: ClassVar[CfgConvention] = "conditional"
+    """CosmosTransformer3DModel. Our rollout.cfg is 1 + the guidance scale of its card: v_c + scale (v_c - v_u)."""
 
     def __init__(self, transformer: nn.Module, null_text: Tensor | None = None) -> None:
         config: Any = transformer.config

@@ -7,17 +7,17 @@ it is told 1000 t (the scheduler's num_train_timesteps).
 Schedulers that round the time they tell to an integer (UniPC in diffusers) differ from this by that rounding.
 """
 
-from typing import Any, ClassVar
+from typing import Any
 
 from torch import Tensor, nn
 
-from wm_nodes.video_model.adapters.velocity import CfgConvention, PublicVelocity
+from wm_nodes.video_model.adapters.velocity import PublicVelocity
 from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.kernels import with_conditioning
 
 
 class WanVelocity(PublicVelocity):
-    """WanTransformer3DModel, or any module with its call.
+    """WanTransformer3DModel, or any module with its call. The guidance scale of its card is our rollout.cfg.
 
     Args:
         fused: first frames are given as clean latents in place, whose tokens are told time 0 (Wan 2.2 TI2V-5B; it also
@@ -27,8 +27,6 @@ class WanVelocity(PublicVelocity):
     Raises:
         ValueError: a transformer with further inputs for the given frames (Wan's I2V models).
     """
-
-    cfg_convention: ClassVar[CfgConvention] = "unconditional"
 
     def __init__(
         self, transformer: nn.Module, null_text: Tensor | None = None, *, fused: bool = False,
