@@ -139,8 +139,7 @@ def measure_clips(
     frames: Tensor, positions: FloatArray, references: Clips, by: Yardstick, num_conditioning: int
 ) -> dict[str, Tensor]:
     """Return by name, float64 (N,), all scores of ClipScores and ClipFaults of decoded clips, uint8 (N, F, H, W, 3),
-    and where there is a reader `reader_success`: 1 where it sees the task done in the last frame, and
-    `reader_probability` of it.
+    and where there is a reader `reader_success`: 1 where it sees the task done in the last frame.
 
     positions: what the probe reads in the clips, (N, F, P).
     """
@@ -148,9 +147,8 @@ def measure_clips(
     faults = find_faults(frames, positions, by.limits, by.scene, num_conditioning).named()
     if by.reader is None:
         return {**scores, **faults}
-    probability = by.reader.read(frames[:, -1])
-    read = {"reader_success": probability >= by.reader.threshold, "reader_probability": probability}
-    return {**scores, **faults, **{name: torch.from_numpy(value.astype(np.float64)) for name, value in read.items()}}
+    read = torch.from_numpy(by.reader.done(frames[:, -1]).astype(np.float64))
+    return {**scores, **faults, "reader_success": read}
 
 
 def fit_tool_correction(positions: FloatArray, truth: FloatArray) -> NDArray[np.float64]:
@@ -170,10 +168,10 @@ def fit_tool_correction(positions: FloatArray, truth: FloatArray) -> NDArray[np.
 
 
 def measure_executability(
-    positions: FloatArray, references: Clips, by: Yardstick, stride: int, *, num_workers: int = 1
+    positions: FloatArray, references: Clips, by: Yardstick, stride: int
 ) -> dict[str, Tensor]:
     """Return by name, float64 (N,), what comes of the clips' tool paths in the simulator (execute_paths):
-    `executed_success`, `executed_object_cm`, `executed_tool_cm`.
+    `executed_success`, `executed_object_cm`.
 
     positions: read by the probe in decoded clips, (N, F, P).
 
@@ -182,13 +180,12 @@ def measure_executability(
     """
     paths = (positions[..., by.scene.tool] @ by.correction[:3] + by.correction[3]).astype(np.float32)
     executed = execute_paths(
-        references.task, by.simulation, references.seeds, paths, positions[:, -1, by.scene.thing], stride,
-        num_workers=num_workers,
+        references.task, by.simulation, references.seeds, paths, positions[:, -1, by.scene.thing], stride
     )
     recorded = references.ground_truth[:, 0]
     other = [not np.allclose(*both, atol=SAME_SCENE) for both in zip(executed.starts, recorded, strict=True)]
     if any(other):
         seed = references.seeds[other.index(True)]
         raise ValueError(f"the simulator's scene of reset seed {seed} is not the recording's")
-    values = {"success": executed.success, "object_cm": executed.object_error_cm, "tool_cm": executed.tool_error_cm}
-    return {f"executed_{name}": torch.from_numpy(np.asarray(value, np.float64)) for name, value in values.items()}
+    values = zip(EXECUTED, (executed.success, executed.object_error_cm), strict=True)
+    return {name: torch.from_numpy(np.asarray(value, np.float64)) for name, value in values}
