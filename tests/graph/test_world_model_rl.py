@@ -210,7 +210,7 @@ def test_training_again_from_the_recording_gives_the_same_weights_and_other_rewa
     shutil.copytree(run_dir, tmp_path / "copy")
     assert main(["retrain", str(tmp_path / "copy"), "--run-dir", str(tmp_path / "same")]) == 2
     assert f"run is '{run_dir}' in this run, '{tmp_path / 'copy'}' is given" in capsys.readouterr().err
-    for name in ("video_000002.safetensors", "video_000004.safetensors", "averaged_000004.safetensors"):
+    for name in ("video_000002.safetensors", "video_000004.safetensors"):
         assert (tmp_path / "same" / "video_policies" / name).read_bytes() == live[name]
     for mine, theirs in zip(read_metrics(tmp_path / "same"), read_metrics(run_dir), strict=True):
         assert {k: v for k, v in mine.items() if "seconds" not in k} == {
