@@ -167,7 +167,6 @@ def test_a_failed_update_leaves_the_weights_as_they_were_and_copies_none_to_the_
 
 
 def test_an_optimizer_step_waits_for_the_device_only_to_report_and_to_see_that_it_is_finite(device: Device) -> None:
-    """The clocks wait too, four times for each call of the network."""
     if device.counts is None:
         pytest.skip("a real device does not count")
     settings = toy_rollout_settings()
@@ -177,9 +176,8 @@ def test_an_optimizer_step_waits_for_the_device_only_to_report_and_to_see_that_i
     device.counts.reset()
     (update,) = learner.train(buffer).updates
     calls, waits = -(-update.transitions // 4), device.counts.by_kind(WAITS)
-    assert waits.pop("synchronize") == 4 * calls > 20
     reports = 3  # the noise that the buffer spent, in all and by step, and what the optimizer step logs
-    assert waits.total() <= 1 + reports, device.counts.report()
+    assert calls > 5 and waits.total() <= 1 + reports, device.counts.report()
     assert device.counts.copies_up <= 10 * calls + 2, device.counts.report()
 
 
