@@ -22,6 +22,7 @@ from torch.testing import assert_close
 from video_toys import ACTION_DIM, tiny_network, toy_buffer, toy_rollout_settings
 
 from benchmarks.video_rl.cost import toy_rollout
+from benchmarks.video_rl.discs import training_batch
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.shipped import shipped_model
@@ -40,8 +41,8 @@ from wm_nodes.video_model.tokenizer_codec import codec_of_world_model
 from wm_nodes.video_rl.execution_reward import load_execution_reward
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.pretraining import make_video_model
-from wm_nodes.video_rl.sampling import RecordedContexts
-from wm_nodes.video_rl.toy_scene import NETWORK, ToyContexts, draw_scenes, load_base, training_batch
+from wm_nodes.video_rl.sampling import RecordedContexts, sample_by_ode
+from wm_nodes.video_rl.toy_scene import NETWORK, ToyContexts, draw_scenes, load_base
 from wm_nodes.video_rl.train import post_train, sample_buffers
 from wm_nodes.video_rl.training_run import VideoRun, progress
 from wm_nodes.video_rl.validation import context_scores
@@ -59,8 +60,7 @@ SMALL = {
 }
 """The preset gpu at a size for tests."""
 NFT = {
-    "grpo.objective": "nft", "grpo.kl.mode": "velocity", "grpo.kl.anchor": "frozen", "grpo.nft.old_decay": 0.5,
-    "grpo.nft.old_ramp": 1.0,
+    "grpo.objective": "nft", "grpo.kl.anchor": "frozen", "grpo.nft.old_decay": 0.5, "grpo.nft.old_ramp": 1.0,
 }
 Found = dict[str, Tensor]
 
@@ -110,12 +110,12 @@ def test_flow_matching_learns_the_same_weights_and_goes_on_from_a_checkpoint(dev
 @pytest.mark.parametrize(
     "changes",
     [
-        {"grpo.kl.anchor": "dual", "grpo.kl.dual_every": 1, "grpo.ema_decay": 0.9},
+        {"grpo.kl.anchor": "dual", "grpo.kl.dual_every": 1},
         {"rollout.buffer_device": "cpu", "grpo.kl.anchor": "frozen", "rollout.storage_dtype": "bfloat16"},
-        {"rollout.sampler.arm": "flow", "rollout.cfg": 2.0, "grpo.cfg": 2.0},
-        {"rollout.noise_store": "zeta_bfloat16", "rollout.sampler.arm": "sage", "rollout.buffer_device": "cpu"},
+        {"rollout.sampler.arm": "flow", "rollout.cfg": 2.0},
+        {"rollout.sampler.arm": "sage", "rollout.buffer_device": "cpu"},
         {**NFT, "rollout.sampler.arm": "ode"},
-        {**NFT, "rollout.buffer_device": "cpu", "grpo.kl.mode": "none"},
+        {**NFT, "rollout.buffer_device": "cpu", "grpo.kl.beta": 0.0},
     ],
     ids=["dual", "host", "flow", "sage", "nft", "nft, host"],
 )
@@ -138,10 +138,10 @@ def test_the_toy_is_sampled_scored_trained_saved_and_evaluated_alike(
                 found[f"buffer {iteration}"] = as_bytes(buffer.to_bytes())
             numbers = [value for update in report.updates for value in list(vars(update).values())[:7]]
             found[f"report {iteration}"] = torch.tensor([*numbers, report.reward_mean, report.noise_share])
-            learner.save(path, iteration=iteration + 1)
+            learner.save(path)
         again = learner_of(ToyContexts(load_base(device=where), config))
-        assert again.load(path) == 2
-        found |= {f"averaged {name}": value.cpu().clone() for name, value in again.averaged.items()}
+        again.load(path)
+        assert again.iterations == 2
         found |= {name: value.cpu() for name, value in source.evaluate(draw_scenes(3, 0, "evaluation")).named().items()}
         following = [source.score(request, source.sample(request)) for request in [source.request(2, learner.version)]]
         for one in (learner, again):
@@ -172,7 +172,6 @@ def test_a_failed_update_leaves_the_weights_as_they_were_and_copies_none_to_the_
 
 
 def test_an_optimizer_step_waits_for_the_device_only_to_report_and_to_see_that_it_is_finite(device: Device) -> None:
-    """The clocks wait too, four times for each call of the network."""
     if device.counts is None:
         pytest.skip("a real device does not count")
     settings = toy_rollout_settings()
@@ -182,9 +181,8 @@ def test_an_optimizer_step_waits_for_the_device_only_to_report_and_to_see_that_i
     device.counts.reset()
     (update,) = learner.train(buffer).updates
     calls, waits = -(-update.transitions // 4), device.counts.by_kind(WAITS)
-    assert waits.pop("synchronize") == 4 * calls > 20
     reports = 3  # the noise that the buffer spent, in all and by step, and what the optimizer step logs
-    assert waits.total() <= 1 + reports, device.counts.report()
+    assert calls > 5 and waits.total() <= 1 + reports, device.counts.report()
     assert device.counts.copies_up <= 10 * calls + 2, device.counts.report()
 
 
@@ -227,7 +225,7 @@ def test_the_preset_gpu_trains_a_video_model_and_post_trains_it_in_a_run_folder(
                 run.train(source.score(request, source.sample(request)))
             run.close()
         assert progress(run_dir) == (2, 2) and device_of(run.network).type == where
-        shown = source.evaluate(heldout, 3).cpu()
+        shown = sample_by_ode(model, heldout, config, 3).cpu()
         assert shown.float().std() > 1
         return found | weights_of(run.network) | {"shown": shown}
 

@@ -22,7 +22,8 @@ from benchmarks.video_rl.judged import JudgedContexts, open_judge
 from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.proxy_plot import plot_proxy
 from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers
-from benchmarks.video_rl.sources import TASK, config_of, reward_spread
+from benchmarks.video_rl.sources import TASK, config_of
+from benchmarks.video_rl.spread import reward_spread
 from benchmarks.video_rl.trainings import OnIteration, RecordedTrainings, row_name
 from benchmarks.video_rl.trials import SamplerTrial
 from wm_nodes.apps.options import prepare_torch
@@ -43,7 +44,7 @@ from wm_nodes.video_model.success_reader import load_success_reader
 from wm_nodes.video_rl.execution_reward import load_execution_reward
 from wm_nodes.video_rl.heldout_metrics import Yardstick, make_yardstick, measure_clips, measure_executability
 from wm_nodes.video_rl.reference_reward import load_probe, score_clips
-from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.sampling import sample_by_ode
 from wm_nodes.world_model.position_probe import PositionProbe
 
 MEASURES = ("success_path", "success", "outcome", "scenery")
@@ -90,7 +91,7 @@ class OutcomeSource(JudgedContexts):
 
     def validate(self) -> Mapping[str, list[float]]:
         self.folder.network.eval()
-        frames = self.evaluate(self._heldout, self.config.evaluation.num_steps)
+        frames = sample_by_ode(self.folder, self._heldout, self.config, self.config.evaluation.num_steps)
         scores = score_clips(frames, self._heldout, self.probe, self.folder.clip["num_conditioning"]).named()
         return {name: scores[name].tolist() for name in SCORES}
 
@@ -173,7 +174,7 @@ class Outcome(RecordedTrainings[OutcomePlan]):
         folder, config = self.folder(), load_video_config("outcome", {"seed": seed})
         if weights is not None:
             load_weights_file(folder.network, weights)
-        frames = ClipGenerator(folder, heldout, config).evaluate(heldout, config.evaluation.num_steps)
+        frames = sample_by_ode(folder, heldout, config, config.evaluation.num_steps)
         positions, given = by.probe.read(frames), folder.clip["num_conditioning"]
         metrics = measure_clips(frames, positions, heldout, by, given)
         metrics |= measure_executability(positions, heldout, by, folder.clip["stride"])

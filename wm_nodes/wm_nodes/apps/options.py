@@ -38,7 +38,7 @@ def add_settings(parser: argparse.ArgumentParser, loop: str = POLICY) -> None:
     """Every setting of a loop, or of its judge alone, as an option: cli.Parser puts those given into
     `arguments.settings`, by their dotted names."""
     if parser.get_default("settings_of") is None:
-        example = {POLICY: "ppo.updates 10", VIDEO: "grpo.clip_low 0.1", JUDGE: "judge.max_reads 3"}[loop]
+        example = {POLICY: "ppo.updates 10", VIDEO: "grpo.clip 0.1", JUDGE: "judge.max_reads 3"}[loop]
         parser.add_argument(
             "--SECTION.KEY", metavar="VALUE", help=f"one of the {loop} settings below, in YAML, e.g. --{example}"
         )

@@ -362,7 +362,7 @@ def describe_arguments(scenario: str) -> str:
             f" One of: {', '.join(choice or '(empty)' for choice in argument.choices)}." if argument.choices else ""
         )
         lines += [f"    {name}:", f"        {argument.help}.{choices} (default: {argument.default!r})"]
-    example, verb = ("grpo.clip_low:=0.1", "train-video-model") if video else ("ppo.num_envs:=8", "train-policy")
+    example, verb = ("grpo.clip:=0.1", "train-video-model") if video else ("ppo.num_envs:=8", "train-policy")
     lines += ["    SECTION.KEY:", f"        Any setting, e.g. {example}; `wm {verb} --help` explains each"]
     return "\n".join(lines)
 

@@ -60,8 +60,6 @@ class ClipSummary:
     """Buffers trained on."""
     version: int
     """Optimizer steps."""
-    weights: str
-    """Which ones were measured after: averaged or last."""
     contexts: int
     """Held-out ones behind each score."""
     scores: Mapping[str, ScoreChange]
@@ -120,7 +118,7 @@ def hacking_text(summary: ClipSummary) -> str:
 
 def scores_table(summary: ClipSummary) -> Table:
     """The table for the terminal."""
-    title = f"held-out contexts (n = {summary.contexts}), one ODE clip each, {summary.weights} weights"
+    title = f"held-out contexts (n = {summary.contexts}), one ODE clip each"
     columns = ("score", "before", "after", "difference, 95 % bootstrap interval", "")
     marks = {"better": "[green]better[/]", "worse": "[red]worse[/]"}
     rows = ((name, *cells, marks.get(verdict, "")) for name, verdict, cells in _rows(summary))

@@ -7,7 +7,7 @@ the held-out metrics beside which a judge's reward is watched (DD-2).
 """
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -186,9 +186,7 @@ def mix_rewards(values: Mapping[str, Tensor], weights: Mapping[str, float]) -> T
 
 def attach_rewards(buffer: RolloutBuffer, scores: Mapping[str, Tensor], total: Tensor) -> RolloutBuffer:
     """Return the buffer with raw scores and the mixed reward `total`; a clip whose total is NaN does not train."""
-    raw = {name: values.double().cpu() for name, values in scores.items()}
-    scored = buffer.with_rewards({"total": total})
-    return replace(scored, rewards={**raw, **scored.rewards})
+    return buffer.with_rewards({**scores, "total": total})
 
 
 def _check_sizes(frames: Tensor, references: Clips) -> None:
