@@ -18,13 +18,15 @@ OPTIONS = {
     "train-model": "--bags --task --out --run-dir --preset --SECTION.KEY --device --seed",
     "train-policy": "--preset --SECTION.KEY --device --task --seed --run-dir --model-dir --from-scratch --force "
     "--environment --video-model --reward --judge --judge-model --judge-key-env --rubric --compose "
-    "--domain-id --verbose",
+    "--view --domain-id --verbose",
     "train-video-model": "--preset --SECTION.KEY --seed --run-dir --from-scratch --bags --heldout-bags --keep-buffers "
-    "--reward --judge --judge-model --judge-key-env --rubric --tensorboard --no-tensorboard --domain-id --verbose",
+    "--reward --judge --judge-model --judge-key-env --rubric --tensorboard --no-tensorboard --view --domain-id "
+    "--verbose",
     "check-video-model": "--video-model --context-bags --public --prompt --picture --size --lora-rank --preset "
     "--SECTION.KEY",
     "seed-study": "--tasks --seeds --arms --preset --SECTION.KEY --device --model-dir --threads --out",
     "collect": "folder --tasks --episodes --first-seed --preset --SECTION.KEY --device",
+    "view": "BAG|RUN_FOLDER --rate --loop --port",
     "rescore": "recording --reward --judge --judge-model --judge-key-env --rubric --json --config --model-dir "
     "--namespace --reads --audit",
     "retrain": "run --run-dir --SECTION.KEY --tensorboard",
