@@ -39,6 +39,7 @@ def run(arguments: argparse.Namespace) -> None:
         feed = Feed(
             page, threshold=threshold_of(folder.settings if folder else {}), with_charts=folder is None,
             clock=lambda: playback.position_s if playback else 0.0,
+            **({"recorded_clip": folder.recorded_clip} if folder else {}),
         )
         looked_s = float("-inf")
 

@@ -45,6 +45,7 @@ class ViewerNode(Node):  # type: ignore[misc]
         self._feed = Feed(
             self.page, threshold=threshold_of(settings), with_charts=self._folder is None,
             namespace=self.get_namespace(),
+            **({"recorded_clip": self._folder.recorded_clip} if self._folder else {}),
         )
         of_simulator = [name for name in TYPES if name.startswith("env/")]
         of_simulator += [topics.EPISODE.name, topics.RUN_STATE.name]

@@ -26,8 +26,9 @@ THUMBNAILS = 8
 """Pictures of the running episode that stay, about evenly apart."""
 KEPT = 8
 """Pictures that wait for the step that they belong to."""
-CLIPS, VERDICTS = 4, 12
-"""Newest clips and verdicts that are shown."""
+CLIPS, VERDICTS, NODES = 4, 12, 256
+"""Newest clips and verdicts, and nodes, that are shown."""
+MOST_STEPS = 10_000
 SOURCES = {
     SOURCE_IMAGINED: "imagined by the model", SOURCE_SIMULATOR: "real: simulator", SOURCE_REAL: "real",
     SOURCE_REPLAY: "a recording",
@@ -61,13 +62,14 @@ class Stream:
         self.about: dict[str, Any] = {"kind": "", "threshold": threshold, "steps": 1, "end": "", "behaviour": ""}
         self.size = (0, 0)
         """Height and width of a tile of env/image, px; 0 before its env/spec has come."""
-        self.outcomes: dict[str, list[bool]] = {}
-        """Success of the finished episodes of all environments, by who acted."""
+        self.outcomes: dict[str, list[int]] = {}
+        """Successful and all finished episodes of all environments, by who acted."""
         self._episode = (0, -1)
         self._signal: list[float] = []
         self._pictures: dict[int, UInt8Array] = {}
         self._steps: dict[int, int] = {}
         self._thumbnails: list[dict[str, Any]] = []
+        self._shown: dict[str, Any] = {}
         self._shown_s = 0.0
 
     def spec(self, message: Any) -> None:
@@ -92,6 +94,8 @@ class Stream:
         if not message.valid[0]:
             return
         episode, step = (int(message.session), int(message.episode_id[0])), int(message.episode_step[0])
+        if step > MOST_STEPS:
+            raise ValueError(f"an episode of {step} steps")
         if episode != self._episode:
             self._episode, self._signal, self._thumbnails, self.about["end"] = episode, [], [], ""
             self._steps.clear()
@@ -108,26 +112,31 @@ class Stream:
 
     def event(self, message: Any) -> None:
         if message.kind == m.KIND_END and message.outcome in (m.OUTCOME_SUCCESS, m.OUTCOME_FAILURE):
-            outcomes = self.outcomes.setdefault(message.behaviour, [])
-            outcomes.append(message.outcome == m.OUTCOME_SUCCESS)
+            counts = self.outcomes.setdefault(message.behaviour, [0, 0])
+            self.outcomes[message.behaviour] = [counts[0] + (message.outcome == m.OUTCOME_SUCCESS), counts[1] + 1]
         if message.env_index == 0:
             self.about["behaviour"] = message.behaviour
+
+    def show_outcomes(self) -> None:
+        """Show what was shown last, with the outcomes of all episodes that have ended since."""
+        ended = {**self.outcomes, "all": [sum(counts) for counts in zip(*self.outcomes.values())]}
+        done = {who: ended[who] for who in (self.about["behaviour"], "all") if ended.get(who)}
+        if self._shown and done != self._shown.get("outcomes"):
+            self._shown["outcomes"] = done
+            self._page.show(f"pictures {self._panel}", self._shown)
 
     def _show(self, stamp: int) -> None:
         """Show a picture whose step is known, unless another one was shown just now."""
         if stamp not in self._pictures or stamp not in self._steps:
             return
-        step, now, last = self._steps[stamp], time.monotonic(), bool(self.about["end"])
+        step, now = self._steps[stamp], time.monotonic()
+        last = bool(self.about["end"]) and step == len(self._signal)
         wanted = step >= (len(self._thumbnails) * self.about["steps"]) // (THUMBNAILS - 1) or last
         if (now - self._shown_s < PICTURE_S and not wanted) or step < (self._thumbnails or [{"step": 0}])[-1]["step"]:
             return
         self._shown_s, picture = now, png(self._pictures.pop(stamp))
-        ended = {**self.outcomes, "all": [one for outcomes in self.outcomes.values() for one in outcomes]}
-        done = {who: [sum(ended[who]), len(ended[who])] for who in (self.about["behaviour"], "all") if ended.get(who)}
-        self._page.show(f"pictures {self._panel}", {
-            **self.about, "picture": picture, "step": step, "episode": self._episode[1], "signal": self._signal,
-            "outcomes": done,
-        })
+        self._shown = {**self.about, "picture": picture, "step": step, "signal": [*self._signal]}
+        self.show_outcomes()
         if wanted:
             self._thumbnails.append({"step": step, "picture": picture})
             self._page.show(f"thumbnails {self._panel}", {"pictures": self._thumbnails, "end": self.about["end"]})
@@ -141,20 +150,21 @@ class Feed:
         with_charts: draw curves of learner/metrics; false where a run folder has them.
         namespace: nodes outside of it are not shown.
         clock: the time by which a node is silent, s.
+        recorded_clip: the recorded frames of a context of loop 2, uint8 (F, H, W, 3); None where they are not at hand.
     """
 
     def __init__(
         self, page: LivePage, *, threshold: float = 0.5, with_charts: bool = True, namespace: str = "/",
         clock: Callable[[], float] = time.monotonic,
+        recorded_clip: Callable[[int], UInt8Array | None] = lambda context: None,
     ) -> None:
         self._page, self._threshold, self._with_charts = page, threshold, with_charts
-        self._namespace, self._clock = namespace, clock
+        self._namespace, self._clock, self._recorded_clip = namespace, clock, recorded_clip
         self._streams: dict[str, Stream] = {}
         self._points: Points = {}
         self._update = 0
         self._nodes: dict[str, dict[str, Any]] = {}
         self._verdicts: deque[dict[str, Any]] = deque(maxlen=VERDICTS)
-        self._clips: dict[str, Any] = {}
         self._strip: UInt8Array | None = None
         self._shown_s = 0.0
         self.dropped = Counter[str]()
@@ -178,6 +188,8 @@ class Feed:
         self._shown_s = now
         ages = {name: self._clock() - node["heard_s"] for name, node in self._nodes.items()}
         rows = [{**node, "node": name, "age_s": max(0.0, ages[name])} for name, node in sorted(self._nodes.items())]
+        for stream in self._streams.values():
+            stream.show_outcomes()
         self._page.show("nodes", {"rows": rows, "dropped": dict(self.dropped)})
         if self._verdicts:
             self._page.show("verdicts", {"rows": [*self._verdicts][::-1]})
@@ -195,7 +207,7 @@ class Feed:
         elif name == topics.EPISODE.name:
             stream.event(message)
             if not stream.about.get("imagined", True) and (outcomes := stream.outcomes.get(message.behaviour)):
-                self._points.setdefault(REAL, {})[self._update] = rate(sum(outcomes), len(outcomes))
+                self._points.setdefault(REAL, {})[self._update] = rate(*outcomes)
         elif name == topics.LEARNER_METRICS.name:
             self._metrics(message)
         elif name == topics.RUN_STATE.name:
@@ -215,7 +227,7 @@ class Feed:
             self._clip_batch(message)
 
     def _hear(self, node: str, **facts: Any) -> None:
-        if node.startswith(self._namespace):
+        if node.startswith(self._namespace) and (node in self._nodes or len(self._nodes) < NODES):
             self._nodes[node] = {**self._nodes.get(node, {}), **facts, "heard_s": self._clock()}
 
     def _metrics(self, message: Any) -> None:
@@ -245,11 +257,13 @@ class Feed:
         if self._strip is None or not count or self._strip.shape[0] % count:
             raise ValueError(f"no picture of {count} clips came before")
         height = self._strip.shape[0] // count
-        rows = range(0, count, int(message.group_size))[:CLIPS]
-        clips = [{"clip": row, "context": int(message.contexts[row // message.group_size]),
-                  "picture": png(self._strip[row * height : (row + 1) * height])} for row in rows]
-        facts = {"iteration": int(message.iteration), "frames": int(message.num_frames)}
-        self._page.show("clips", {**facts, "clips": clips})
+        frames, clips = int(message.num_frames), []
+        for row, context in zip(range(0, count, int(message.group_size)), message.contexts[:CLIPS]):
+            clip = {"clip": row, "picture": png(self._strip[row * height : (row + 1) * height]), "recorded": ""}
+            if (recorded := self._recorded_clip(int(context))) is not None and len(recorded) >= frames:
+                clip["recorded"] = png(np.concatenate([*recorded[:frames]], 1))
+            clips.append(clip)
+        self._page.show("clips", {"iteration": int(message.iteration), "frames": frames, "clips": clips})
 
 
 def png(picture: UInt8Array) -> str:

@@ -3,16 +3,19 @@
 import base64
 import json
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.load import ConfigError, read_yaml
 from wm_nodes.core.statistics import wilson_interval
+from wm_nodes.core.types import UInt8Array
 from wm_nodes.reports.clip_report import clip_panels
 from wm_nodes.reports.curves import POLICY_PANELS, Panel
 from wm_nodes.reports.live_page import LivePage
 from wm_nodes.training.metrics import FILE_NAME, read_metrics
 from wm_nodes.training.run_record import CONFIG
+from wm_nodes.video_model.clips import load_clips
 
 Points = dict[str, dict[int, list[float]]]
 """Metric, update, then its value alone or with the ends of its 95 % interval."""
@@ -23,6 +26,8 @@ PANELS = (
 )
 MOST_POINTS = 400
 """Of one line; of more, some evenly apart are drawn."""
+MOST_BAGS = 8
+"""Bags of recordings that are held in memory for looking on."""
 PICTURES, CURVES = "pictures", "curves.png"
 
 
@@ -54,6 +59,19 @@ class RunFolder:
             return read_yaml(self.path / CONFIG)
         except ConfigError:
             return {}
+
+    @cached_property
+    def _clips(self) -> Any:
+        """The recordings that loop 2 takes its contexts from, uint8 (N, F, H, W, 3)."""
+        bags, settings = sorted((self.path / "data" / "train").glob("shard_*")), self.settings
+        if not bags or len(bags) > MOST_BAGS or "grpo" not in settings or settings["groups"]["history"]:
+            return ()
+        return load_clips(bags, settings["model"]["stride"], settings["clip_steps"]).frames.numpy()
+
+    def recorded_clip(self, context: int) -> UInt8Array | None:
+        """The frames of a context of loop 2, uint8 (F, H, W, 3); None where they are too many to be kept, or begin
+        elsewhere."""
+        return self._clips[context] if context < len(self._clips) else None
 
     def show(self, page: LivePage) -> None:
         """Show what has changed since the last call; files that are being written are read the next time."""
