@@ -99,4 +99,4 @@ def test_a_port_in_use_is_named_with_the_remedy_and_a_closed_page_frees_it(page:
     page.close()
     assert events.read() == b"", "the browser is let go at once"
     with LivePage(port) as again:
-        assert again.port == port != free_port("0")
+        assert again.port == port != int(free_port("0"))

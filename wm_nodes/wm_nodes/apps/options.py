@@ -109,7 +109,7 @@ def view(arguments: argparse.Namespace, say: Callable[[str], None]) -> dict[str,
         return {}
     port = free_port(arguments.view)
     say(f"live page http://{HOST}:{port}/")
-    return {"view": PAGE, "view_port": str(port)}
+    return {"view": PAGE, "view_port": port}
 
 
 def add_tensorboard(parser: argparse.ArgumentParser) -> None:

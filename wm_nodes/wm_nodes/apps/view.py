@@ -9,18 +9,16 @@ what its files say, and plays its newest recording. Ctrl-C ends it.
 
 import argparse
 import time
+from contextlib import suppress
 from pathlib import Path
 
-from wm_nodes.nodes.viewer.feed import Feed, row_of
-from wm_nodes.nodes.viewer.run_folder import RunFolder, threshold_of
+from wm_nodes.nodes.viewer.feed import TABLE_S, Feed, row_of
+from wm_nodes.nodes.viewer.run_folder import RunFolder
 from wm_nodes.recording import BagError
 from wm_nodes.recording.bag import METADATA, Bag
 from wm_nodes.recording.playback import Playback
 from wm_nodes.reports.live_page import LivePage
 from wm_nodes.training.run_record import CONFIG
-
-LOOK_S = 1.0
-"""Between two looks at the files of a run."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -36,36 +34,22 @@ def run(arguments: argparse.Namespace) -> None:
     bag = path if folder is None else newest_bag(folder.path)
     playback = None if bag is None else open_bag(bag, arguments.rate, loop=arguments.loop)
     with LivePage(arguments.port) as page:
-        feed = Feed(
-            page, threshold=threshold_of(folder.settings if folder else {}), with_charts=folder is None,
-            clock=lambda: playback.position_s if playback else 0.0,
-            **({"recorded_clip": folder.recorded_clip} if folder else {}),
-        )
-        looked_s = float("-inf")
+        feed = Feed(page, folder, clock=lambda: playback.position_s if playback else 0.0)
 
         def look(ended: bool = False) -> None:
-            nonlocal looked_s
-            feed.tick()
-            if time.monotonic() - looked_s < LOOK_S and not ended:
-                return
-            looked_s = time.monotonic()
-            if folder is not None:
-                folder.show(page)
-            if playback is not None:
+            if feed.tick() and playback is not None:
                 page.show("playback", {
                     "bag": str(bag), "position_s": playback.position_s, "duration_s": playback.duration_s,
                     "rate": arguments.rate, "ended": ended,
                 })
 
         print(f"live page {page.url}\nCtrl-C ends it", flush=True)
-        try:
+        with suppress(KeyboardInterrupt):
             if playback is not None:
                 playback.run(feed.put, lambda time_ns: look(), say=print)
             while True:
                 look(ended=True)
-                time.sleep(LOOK_S)
-        except KeyboardInterrupt:
-            return
+                time.sleep(TABLE_S)
 
 
 def newest_bag(run_dir: Path) -> Path | None:

@@ -165,7 +165,7 @@ def _resolve(scenario: str, values: Mapping[str, str], config: RunConfig | Video
     if values["params_file"]:
         _check_params(values["params_file"])
     if values["view"] == PAGE:
-        filled["view_port"] = str(free_port(values["view_port"]))
+        filled["view_port"] = free_port(values["view_port"])
     if isinstance(config, RunConfig):
         if values.get("num_envs") == "0":
             filled["num_envs"] = str(config.ppo.num_envs)

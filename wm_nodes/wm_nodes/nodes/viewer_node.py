@@ -14,8 +14,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 
-from wm_nodes.nodes.viewer.feed import TYPES, VIEW, Feed
-from wm_nodes.nodes.viewer.run_folder import RunFolder, threshold_of
+from wm_nodes.nodes.viewer.feed import TABLE_S, TYPES, VIEW, Feed
+from wm_nodes.nodes.viewer.run_folder import RunFolder
 from wm_nodes.recording import topics
 from wm_nodes.reports.live_page import LivePage
 from wm_nodes.ros.middleware import set_node_defaults
@@ -24,7 +24,6 @@ from wm_nodes.ros.qos import topic
 from wm_nodes.ros.spin import executor_kind, init, make_executor, spin, stop_on_signals
 
 PARAMS = (Param("port", 0, "Of the page, on this host only; 0: a free one", read_only=True, minimum=0, maximum=65535),)
-PERIOD_S = 0.5
 NICENESS = 10
 """Whoever trains on the same core goes first."""
 DEPTH = 64
@@ -39,14 +38,8 @@ class ViewerNode(Node):  # type: ignore[misc]
         super().__init__("viewer", enable_rosout=False)
         declare(self, (*COMMON, *PARAMS))
         run_dir = str(self.get_parameter("run_dir").value)
-        self._folder = RunFolder(Path(run_dir)) if run_dir else None
         self.page = LivePage(int(self.get_parameter("port").value))
-        settings = self._folder.settings if self._folder else {}
-        self._feed = Feed(
-            self.page, threshold=threshold_of(settings), with_charts=self._folder is None,
-            namespace=self.get_namespace(),
-            **({"recorded_clip": self._folder.recorded_clip} if self._folder else {}),
-        )
+        feed = Feed(self.page, RunFolder(Path(run_dir)) if run_dir else None, namespace=self.get_namespace())
         of_simulator = [name for name in TYPES if name.startswith("env/")]
         of_simulator += [topics.EPISODE.name, topics.RUN_STATE.name]
         for name in (*TYPES, *(SIMULATOR + name for name in of_simulator)):
@@ -54,14 +47,9 @@ class ViewerNode(Node):  # type: ignore[misc]
             if base != topics.IMAGES.name:  # all environments in one picture: too much for looking on
                 kind, profile = (Image, _passing()) if base == VIEW else (topic(base).type, _hearing(base))
                 absolute = self.resolve_topic_name(name)
-                self.create_subscription(kind, name, partial(self._feed.put, absolute), profile, raw=True)
-        self.create_timer(PERIOD_S, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
+                self.create_subscription(kind, name, partial(feed.put, absolute), profile, raw=True)
+        self.create_timer(TABLE_S, feed.tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(f"live page {self.page.url}")
-
-    def _on_timer(self) -> None:
-        self._feed.tick()
-        if self._folder is not None:
-            self._folder.show(self.page)
 
 
 def _passing() -> QoSProfile:

@@ -140,12 +140,12 @@ class _Browser(BaseHTTPRequestHandler):
         self.end_headers()
 
 
-def free_port(given: str) -> int:
+def free_port(given: str) -> str:
     """The port of a page to be opened: the given one, or for 0 a free one. Raises ValueError as LivePage."""
     if not given.isdecimal():
         raise ValueError(f"port must be a whole number, got {given!r}; give 1024 to 65535, or 0 for a free one")
     with LivePage(int(given)) as page:
-        return page.port
+        return str(page.port)
 
 
 def _page() -> tuple[bytes, str]:

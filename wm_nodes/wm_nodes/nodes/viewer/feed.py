@@ -14,7 +14,7 @@ import numpy as np
 
 from wm_nodes.core.specs import SOURCE_IMAGINED, SOURCE_REAL, SOURCE_REPLAY, SOURCE_SIMULATOR
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.nodes.viewer.run_folder import REAL, SUCCESS, Points, charts, rate
+from wm_nodes.nodes.viewer.run_folder import REAL, SUCCESS, Points, RunFolder, charts, rate
 from wm_nodes.recording import messages as m
 from wm_nodes.recording import topics
 from wm_nodes.reports.live_page import LivePage
@@ -143,23 +143,20 @@ class Stream:
 
 
 class Feed:
-    """Shows what comes on a page.
+    """Shows what comes on a page, and what the files of a run say.
 
     Args:
-        threshold: of the done signal, above which an imagined episode ends.
-        with_charts: draw curves of learner/metrics; false where a run folder has them.
+        folder: of the run, whose curves are drawn; None: those of learner/metrics are.
         namespace: nodes outside of it are not shown.
         clock: the time by which a node is silent, s.
-        recorded_clip: the recorded frames of a context of loop 2, uint8 (F, H, W, 3); None where they are not at hand.
     """
 
     def __init__(
-        self, page: LivePage, *, threshold: float = 0.5, with_charts: bool = True, namespace: str = "/",
+        self, page: LivePage, folder: RunFolder | None = None, *, namespace: str = "/",
         clock: Callable[[], float] = time.monotonic,
-        recorded_clip: Callable[[int], UInt8Array | None] = lambda context: None,
     ) -> None:
-        self._page, self._threshold, self._with_charts = page, threshold, with_charts
-        self._namespace, self._clock, self._recorded_clip = namespace, clock, recorded_clip
+        self._page, self._folder, self._namespace, self._clock = page, folder, namespace, clock
+        self._threshold = 0.5 if folder is None else folder.threshold
         self._streams: dict[str, Stream] = {}
         self._points: Points = {}
         self._update = 0
@@ -180,11 +177,11 @@ class Feed:
         except Exception:  # whatever a foreign program sent: nobody's training ends for a picture
             self.dropped[topic] += 1
 
-    def tick(self) -> None:
-        """Show the tables, if they are due; called often."""
+    def tick(self) -> bool:
+        """Show the tables, and what the run's files say, if they are due; return whether they were. Called often."""
         now = time.monotonic()
         if now - self._shown_s < TABLE_S:
-            return
+            return False
         self._shown_s = now
         ages = {name: self._clock() - node["heard_s"] for name, node in self._nodes.items()}
         rows = [{**node, "node": name, "age_s": max(0.0, ages[name])} for name, node in sorted(self._nodes.items())]
@@ -193,8 +190,11 @@ class Feed:
         self._page.show("nodes", {"rows": rows, "dropped": dict(self.dropped)})
         if self._verdicts:
             self._page.show("verdicts", {"rows": [*self._verdicts][::-1]})
-        if self._with_charts and self._points.keys() - {REAL}:
+        if self._folder is not None:
+            self._folder.show(self._page)
+        elif self._points.keys() - {REAL}:
             self._page.show("charts", {"charts": charts(self._points)})
+        return True
 
     def _take(self, namespace: str, name: str, message: Any) -> None:
         stream = self._streams.setdefault(namespace, Stream(self._page, namespace or "/", self._threshold))
@@ -260,7 +260,8 @@ class Feed:
         frames, clips = int(message.num_frames), []
         for row, context in zip(range(0, count, int(message.group_size)), message.contexts[:CLIPS]):
             clip = {"clip": row, "picture": png(self._strip[row * height : (row + 1) * height]), "recorded": ""}
-            if (recorded := self._recorded_clip(int(context))) is not None and len(recorded) >= frames:
+            recorded = self._folder.recorded_clip(int(context)) if self._folder else None
+            if recorded is not None and len(recorded) >= frames:
                 clip["recorded"] = png(np.concatenate([*recorded[:frames]], 1))
             clips.append(clip)
         self._page.show("clips", {"iteration": int(message.iteration), "frames": frames, "clips": clips})
@@ -268,4 +269,4 @@ class Feed:
 
 def png(picture: UInt8Array) -> str:
     """An RGB picture as base64 of a PNG."""
-    return base64.b64encode(cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1]).decode()
+    return base64.b64encode(cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes()).decode()

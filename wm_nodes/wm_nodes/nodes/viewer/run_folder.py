@@ -2,7 +2,7 @@
 
 import base64
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -73,6 +73,11 @@ class RunFolder:
         elsewhere."""
         return self._clips[context] if context < len(self._clips) else None
 
+    @property
+    def threshold(self) -> float:
+        """Of the done signal, above which an imagined episode ends."""
+        return float(self.settings.get("reward", {}).get("success_threshold", 0.5))
+
     def show(self, page: LivePage) -> None:
         """Show what has changed since the last call; files that are being written are read the next time."""
         trainings = sorted((self.path / "rounds").glob("[0-9]*"), key=lambda folder: int(folder.name)) or [self.path]
@@ -118,11 +123,6 @@ class RunFolder:
                     points.setdefault(REAL, {})[update] = rate(sum(success), len(success))
             first = last
         return points
-
-
-def threshold_of(settings: Mapping[str, Any]) -> float:
-    """Of the done signal, above which an imagined episode ends."""
-    return float(settings.get("reward", {}).get("success_threshold", 0.5))
 
 
 def _thinned(points: list[list[float]]) -> list[list[float]]:
