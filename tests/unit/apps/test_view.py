@@ -23,6 +23,7 @@ from wm_msgs.msg import ClipBatch, ClipVerdict, EpisodeEvent, LearnerMetrics, Ru
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.nodes.viewer.feed import Feed
+from wm_nodes.nodes.viewer.run_folder import RunFolder
 from wm_nodes.recording import RawBagWriter, topics
 from wm_nodes.recording import messages as m
 from wm_nodes.reports.film_strip import film_strip
@@ -179,6 +180,19 @@ def test_what_cannot_be_shown_is_refused_in_one_line(tmp_path: Path, capsys: pyt
             assert main(["view", *words]) == 2
             text = capsys.readouterr().err
             assert text.startswith("error: ") and text.count("\n") == 1 and said in text
+
+
+def test_a_folder_that_is_no_run_is_counted_and_the_rest_is_shown(tmp_path: Path) -> None:
+    (tmp_path / "rounds" / "last").mkdir(parents=True)
+    (tmp_path / "config.yaml").write_text("reward: {success_threshold: 0.9}\nppo: 3\n")
+    (tmp_path / "metrics.jsonl").write_text("[]\n")
+    with LivePage() as page:
+        feed = Feed(page, RunFolder(tmp_path))
+        feed.put("/wm/run/state", cdr(RunState(node="/wm/learner", state=1)))
+        assert feed.tick()
+        assert feed.dropped == {"the run folder": 1}
+        _, events = page.since(0, 1.0)
+        assert b"/wm/learner" in events[0]
 
 
 def test_what_makes_no_sense_is_dropped_and_counted_and_the_rest_is_shown() -> None:

@@ -174,7 +174,7 @@ class Feed:
             return
         try:
             self._take(topic.removesuffix(name).rstrip("/"), name, m.deserialize(data, TYPES[name]))
-        except Exception:  # whatever a foreign program sent: nobody's training ends for a picture
+        except Exception:  # whatever a foreign program sent: nothing ends for a picture
             self.dropped[topic] += 1
 
     def tick(self) -> bool:
@@ -191,7 +191,10 @@ class Feed:
         if self._verdicts:
             self._page.show("verdicts", {"rows": [*self._verdicts][::-1]})
         if self._folder is not None:
-            self._folder.show(self._page)
+            try:
+                self._folder.show(self._page)
+            except Exception:  # whatever stands in its files
+                self.dropped["the run folder"] += 1
         elif self._points.keys() - {REAL}:
             self._page.show("charts", {"charts": charts(self._points)})
         return True

@@ -64,9 +64,12 @@ class RunFolder:
     def _clips(self) -> Any:
         """The recordings that loop 2 takes its contexts from, uint8 (N, F, H, W, 3)."""
         bags, settings = sorted((self.path / "data" / "train").glob("shard_*")), self.settings
-        if not bags or len(bags) > MOST_BAGS or "grpo" not in settings or settings["groups"]["history"]:
-            return ()
-        return load_clips(bags, settings["model"]["stride"], settings["clip_steps"]).frames.numpy()
+        try:
+            if 0 < len(bags) <= MOST_BAGS and not settings["groups"]["history"]:
+                return load_clips(bags, settings["model"]["stride"], settings["clip_steps"]).frames.numpy()
+        except (OSError, ValueError, KeyError):
+            pass
+        return ()
 
     def recorded_clip(self, context: int) -> UInt8Array | None:
         """The frames of a context of loop 2, uint8 (F, H, W, 3); None where they are too many to be kept, or begin
@@ -79,31 +82,26 @@ class RunFolder:
         return float(self.settings.get("reward", {}).get("success_threshold", 0.5))
 
     def show(self, page: LivePage) -> None:
-        """Show what has changed since the last call; files that are being written are read the next time."""
-        trainings = sorted((self.path / "rounds").glob("[0-9]*"), key=lambda folder: int(folder.name)) or [self.path]
+        """Show what has changed since the last call. Raises whatever files make that are not of a run."""
+        rounds = [folder for folder in (self.path / "rounds").glob("*") if folder.name.isdecimal()]
+        trainings = sorted(rounds, key=lambda folder: int(folder.name)) or [self.path]
         files = [self.path / CONFIG, self.path / "summary.json", *sorted((self.path / PICTURES).glob("*.png"))]
         for one in trainings:
             files += [one / FILE_NAME, *sorted((one / "evaluations").glob("*.json"))]
         seen = [(file, file.stat().st_mtime_ns) for file in files if file.is_file()]
         if seen == self._seen:
             return
-        try:
-            points = self._points(trainings)
-            settings, finished = self.settings, (self.path / "summary.json").is_file()
-            pictures = [file for file, _ in seen if file.suffix == ".png" and file.name != CURVES]
-            page.show("run", {
-                "folder": str(self.path), "task": settings.get("task", ""), "finished": finished,
-                "updates": settings.get("ppo", {}).get("updates") or settings.get("iterations"),
-                "video": "grpo" in settings,
-            })
-            page.show("charts", {"charts": charts(points)})
-            page.show("strips", {"strips": [
-                {"name": file.stem.replace("_", " "), "picture": base64.b64encode(file.read_bytes()).decode()}
-                for file in pictures
-            ]})
-        except (OSError, ValueError, KeyError):
-            return
-        self._seen = seen
+        self._seen, settings = seen, self.settings
+        page.show("run", {
+            "folder": str(self.path), "task": settings.get("task", ""), "video": "grpo" in settings,
+            "finished": (self.path / "summary.json").is_file(),
+            "updates": settings.get("ppo", {}).get("updates") or settings.get("iterations"),
+        })
+        page.show("charts", {"charts": charts(self._points(trainings))})
+        page.show("strips", {"strips": [
+            {"name": file.stem.replace("_", " "), "picture": base64.b64encode(file.read_bytes()).decode()}
+            for file, _ in seen if file.suffix == ".png" and file.name != CURVES
+        ]})
 
     def _points(self, trainings: Sequence[Path]) -> Points:
         """Of consecutive trainings, their updates counted on."""
