@@ -13,6 +13,7 @@ import pytest
 from benchmarks.experiment import EXPERIMENTS
 from wm_nodes.apps import cli
 from wm_nodes.core.errors import ModelNotAcceptedError, RunError
+from wm_nodes.reports.live_page import LivePage
 
 OPTIONS = {
     "train-model": "--bags --task --out --run-dir --preset --SECTION.KEY --device --seed",
@@ -96,6 +97,18 @@ def test_an_error_is_one_line_and_code_2(words: list[str], said: str, capsys: py
     assert cli.main(words) == 2
     text = capsys.readouterr().err
     assert text.startswith("error: ") and text.count("\n") == 1 and said in text
+
+
+def test_a_page_that_cannot_be_opened_is_one_line_before_anything_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with LivePage() as other:
+        for verb in ("train-policy", "train-video-model"):
+            assert cli.main([verb, "--preset", "smoke", "--view", str(other.port)]) == 2
+            text = capsys.readouterr().err
+            assert text.startswith(f"error: port {other.port} of this host cannot be used") and text.count("\n") == 1
+    assert not [*tmp_path.iterdir()]
 
 
 def test_a_wrong_option_is_one_line_and_code_2(capsys: pytest.CaptureFixture[str]) -> None:

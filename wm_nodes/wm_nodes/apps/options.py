@@ -95,21 +95,20 @@ def add_graph(parser: argparse.ArgumentParser) -> None:
 
 
 def add_view(parser: argparse.ArgumentParser) -> None:
-    """--view; view() reads it."""
+    """--view; take_port reads it."""
     parser.add_argument(
         "--view", nargs="?", const="0", default="", metavar="PORT",
         help="open a live page for this host: pictures, done signal, curves, verdicts, nodes (port: a free one)",
     )
 
 
-def view(arguments: argparse.Namespace, say: Callable[[str], None]) -> dict[str, str]:
-    """The launch arguments that a given --view stands for, with its port, which is said. Raises ValueError: as
-    free_port."""
-    if not arguments.view:
-        return {}
-    port = free_port(arguments.view)
-    say(f"live page http://{HOST}:{port}/")
-    return {"view": PAGE, "view_port": port}
+def take_port(arguments: argparse.Namespace) -> None:
+    """Make `arguments.view` the launch arguments that --view stands for, and say where the page will be. Raises
+    ValueError: as free_port."""
+    given = arguments.view
+    arguments.view = {"view": PAGE, "view_port": free_port(given)} if given else {}
+    if given:
+        print(f"live page http://{HOST}:{arguments.view['view_port']}/", flush=True)
 
 
 def add_tensorboard(parser: argparse.ArgumentParser) -> None:

@@ -84,6 +84,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Take or record episodes, take or train a video model, run GRPO over the graph, measure, report."""
     options.prepare_torch()
+    options.take_port(arguments)
     with opened(arguments) as (config, run_dir):
         _run(arguments, config, run_dir)
 
@@ -99,7 +100,6 @@ def opened(arguments: argparse.Namespace) -> AbstractContextManager[tuple[VideoR
 def _run(arguments: argparse.Namespace, config: VideoRlConfig, run_dir: Path) -> None:
     stage = Stages()
     stage(f"run folder {run_dir}")
-    view = options.view(arguments, stage)
     scene = load_config("cpu", {"task": config.task, "seed": config.seed})
     probe = load_probe(shipped_model(config.task), compute_device(config.device))
     shipped = None if arguments.from_scratch else shipped_video_model(config)
@@ -118,7 +118,7 @@ def _run(arguments: argparse.Namespace, config: VideoRlConfig, run_dir: Path) ->
     make_video_model(config, clips, heldout, probe, run_dir, shipped=shipped, command=arguments.command)
     version, done = progress(run_dir)
     if done < config.iterations:
-        _post_train(arguments, config, (bags, heldout_bags), run_dir, stage, view)
+        _post_train(arguments, config, (bags, heldout_bags), run_dir, stage)
         version, done = progress(run_dir)
     conclude(
         config, run_dir, base=run_dir / "video_model", iterations=done, version=version, heldout=heldout, probe=probe,
@@ -153,17 +153,16 @@ def _data(scene: RunConfig, episodes: int, run_dir: Path, stage: Stages) -> tupl
 
 def _post_train(
     arguments: argparse.Namespace, config: VideoRlConfig, bags: tuple[list[Path], list[Path]], run_dir: Path,
-    stage: Stages, view: Mapping[str, str],
+    stage: Stages,
 ) -> None:
-    """GRPO over the graph, from the learner's checkpoint on. bags: of contexts, and of held-out ones. view: the launch
-    arguments of the live page."""
+    """GRPO over the graph, from the learner's checkpoint on. bags: of contexts, and of held-out ones."""
     contexts, heldout = (",".join(map(str, some)) for some in bags)
     graph, _ = launch_arguments.prepare("world_model_rl", {
         "run_dir": str(run_dir),
         "bag_uri": str(run_dir / "bags" / f"world_model_rl_{time.strftime('%Y%m%d_%H%M%S')}"),
         "video_model_dir": str(run_dir / "video_model"), "context_bags": contexts, "heldout_bags": heldout,
         "keep_buffers": str(arguments.keep_buffers), "tensorboard": "true" if arguments.tensorboard else "false",
-        "domain_id": arguments.domain_id, **view,
+        "domain_id": arguments.domain_id, **arguments.view,
     })
     stage("starting the graph: " + ", ".join(node.label for node in graph.nodes))
     with Runner(graph, log_dir=run_dir / "logs", log=sys.stdout if arguments.verbose else None) as runner:
