@@ -73,7 +73,7 @@ def write_training(path: Path) -> Path:
                     for space, graph in (("/wm/sim", real), ("/wm", imagined))
                     for topic, message, time_ns in graph.published]
         messages += [(name, cdr(message), 100_000_000) for name, message in others]
-        messages += [("/wm/clips/image", m.serialize(m.image_message(strip, 1)), 100_000_000),
+        messages += [("/wm/clips/image", m.serialize(m.image_message(strip, 0)), 100_000_000),
                      ("/wm/clips", cdr(clips), 100_000_000),
                      ("/wm/run/state", b"\x00\x01\x00\x00garbage", 200_000_000)]
         for name, data, time_ns in sorted(messages, key=lambda message: message[2]):

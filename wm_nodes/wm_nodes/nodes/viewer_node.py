@@ -35,7 +35,7 @@ class ViewerNode(Node):  # type: ignore[misc]
     """Serves the page until the process ends."""
 
     def __init__(self) -> None:
-        super().__init__("viewer", enable_rosout=False)
+        super().__init__("viewer", enable_rosout=False, start_parameter_services=False)
         declare(self, (*COMMON, *PARAMS))
         run_dir = str(self.get_parameter("run_dir").value)
         self.page = LivePage(int(self.get_parameter("port").value))

@@ -14,7 +14,7 @@ import numpy as np
 
 from wm_nodes.core.specs import SOURCE_IMAGINED, SOURCE_REAL, SOURCE_REPLAY, SOURCE_SIMULATOR
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.nodes.viewer.run_folder import REAL, SUCCESS, Points, RunFolder, charts, rate
+from wm_nodes.nodes.viewer.run_folder import DRAWN, REAL, SUCCESS, Points, RunFolder, charts, rate
 from wm_nodes.recording import messages as m
 from wm_nodes.recording import topics
 from wm_nodes.reports.live_page import LivePage
@@ -37,8 +37,6 @@ METRICS = (SUCCESS, "mean_return", "kl_reference", "loss_value")
 """Of learner/metrics, beside those that travel by name."""
 STATES = ("idle", "running", "finished", "failed")
 STATUSES = ("ok", "skipped", "abstains", "error")
-
-
 _RECORDED = (
     topics.SPEC, topics.IMAGES, topics.TRANSITION, topics.EPISODE, topics.LEARNER_METRICS, topics.RUN_STATE,
     topics.VERDICT, topics.CLIPS, topics.CLIP_IMAGES, topics.CLIP_SCORES,
@@ -77,7 +75,7 @@ class Stream:
         self.size = tiles.tile_height, tiles.tile_width
         self.about |= {"kind": SOURCES.get(spec.source, "real"), "imagined": spec.source == SOURCE_IMAGINED,
                        "environment": spec.env_id, "cameras": spec.cameras, "steps": spec.max_episode_steps,
-                       "environments": spec.num_envs, "instruction": spec.instruction}
+                       "instruction": spec.instruction}
 
     def image(self, message: Any, size: tuple[int, int]) -> None:
         """size: height and width of environment 0 at the upper left, px."""
@@ -162,7 +160,7 @@ class Feed:
         self._update = 0
         self._nodes: dict[str, dict[str, Any]] = {}
         self._verdicts: deque[dict[str, Any]] = deque(maxlen=VERDICTS)
-        self._strip: UInt8Array | None = None
+        self._clips: dict[str, Any] = {}
         self._shown_s = 0.0
         self.dropped = Counter[str]()
         """Messages that could not be read, by topic."""
@@ -214,7 +212,7 @@ class Feed:
         elif name == topics.LEARNER_METRICS.name:
             self._metrics(message)
         elif name == topics.RUN_STATE.name:
-            self._hear(message.node, state=STATES[message.state], detail=message.detail)
+            self._hear(message.node, state=STATES[message.state])
         elif name == DIAGNOSTICS:
             for status in message.status:
                 self._hear(status.name.partition(":")[0], level=int(status.level), message=status.message)
@@ -224,10 +222,10 @@ class Feed:
             totals = np.asarray(message.total)[np.asarray(message.valid, bool)]
             if totals.size:
                 self._points.setdefault("grpo/reward_mean", {})[int(message.iteration)] = [float(totals.mean())]
-        elif name == topics.CLIP_IMAGES.name:
-            self._strip = np.asarray(message.data, np.uint8).reshape(message.height, message.width, 3)
         else:
-            self._clip_batch(message)
+            self._clips[name] = message
+            if len({m.stamp_ns(part.header.stamp) for part in self._clips.values()}) == 1 < len(self._clips):
+                self._show_clips(self._clips[topics.CLIPS.name], self._clips[topics.CLIP_IMAGES.name])
 
     def _hear(self, node: str, **facts: Any) -> None:
         if node.startswith(self._namespace) and (node in self._nodes or len(self._nodes) < NODES):
@@ -237,7 +235,7 @@ class Feed:
         self._update = int(message.update)
         values = {name: getattr(message, name) for name in METRICS} | dict(zip(message.names, message.values))
         for name, value in values.items():
-            if np.isfinite(value):
+            if name in DRAWN and np.isfinite(value):
                 self._points.setdefault(name, {})[self._update] = [float(value)]
 
     def _verdict(self, message: Any) -> None:
@@ -251,23 +249,21 @@ class Feed:
         failing = [text for text, p in zip(message.component_reasons, message.component_p_fail) if text and p > 0.5]
         self._verdicts.append({
             "clip": message.clip_id, "status": STATUSES[message.status], "reward": float(message.reward),
-            "stages": stages, "reason": message.reason or "; ".join(failing[:2]), "judge": message.model,
+            "stages": stages, "reason": message.reason or "; ".join(failing[:2]),
         })
 
-    def _clip_batch(self, message: Any) -> None:
-        """The first clip of some contexts: the picture of all clips has come before."""
-        count = len(message.contexts) * int(message.group_size)
-        if self._strip is None or not count or self._strip.shape[0] % count:
-            raise ValueError(f"no picture of {count} clips came before")
-        height = self._strip.shape[0] // count
-        frames, clips = int(message.num_frames), []
-        for row, context in zip(range(0, count, int(message.group_size)), message.contexts[:CLIPS]):
-            clip = {"clip": row, "picture": png(self._strip[row * height : (row + 1) * height]), "recorded": ""}
+    def _show_clips(self, batch: Any, image: Any) -> None:
+        """The first clip of some contexts. image: a row per clip, a column per frame."""
+        strip = np.asarray(image.data, np.uint8).reshape(image.height, image.width, 3)
+        count, frames, clips = len(batch.contexts) * int(batch.group_size), int(batch.num_frames), []
+        height = strip.shape[0] // count
+        for row, context in zip(range(0, count, int(batch.group_size)), batch.contexts[:CLIPS]):
+            clip = {"clip": row, "picture": png(strip[row * height : (row + 1) * height]), "recorded": ""}
             recorded = self._folder.recorded_clip(int(context)) if self._folder else None
             if recorded is not None and len(recorded) >= frames:
                 clip["recorded"] = png(np.concatenate([*recorded[:frames]], 1))
             clips.append(clip)
-        self._page.show("clips", {"iteration": int(message.iteration), "frames": frames, "clips": clips})
+        self._page.show("clips", {"iteration": int(batch.iteration), "frames": frames, "clips": clips})
 
 
 def png(picture: UInt8Array) -> str:

@@ -24,6 +24,7 @@ PANELS = (
     Panel("success (share of episodes)", {SUCCESS: "imagined", REAL: "real, 95 % interval"}, (0.0, 1.0)),
     *(panel for panel in POLICY_PANELS if SUCCESS not in panel.lines), *clip_panels(1),
 )
+DRAWN = {name for panel in PANELS for name in panel.lines}
 MOST_POINTS = 400
 """Of one line; of more, some evenly apart are drawn."""
 MOST_BAGS = 8
@@ -112,8 +113,8 @@ class RunFolder:
                 section, step = line.pop("section"), first + int(str(line.pop("step")))
                 last = max(last, step)
                 for name, value in line.items():
-                    if isinstance(value, (int, float)):
-                        for key in (f"{section}/{name}", *([name] if section == "ppo" else [])):
+                    for key in DRAWN & {f"{section}/{name}", *([name] if section == "ppo" else [])}:
+                        if isinstance(value, (int, float)):
                             points.setdefault(key, {})[step] = [float(value)]
             for name, update in (("before", first), ("after", last)):
                 if (file := folder / "evaluations" / f"real_{name}.json").is_file():
