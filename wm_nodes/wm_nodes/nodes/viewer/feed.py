@@ -53,9 +53,14 @@ def row_of(topic: str) -> str:
 
 
 class Stream:
-    """Environment 0 of one namespace, and the outcomes of all its environments. panel: its name, of the page."""
+    """Environment 0 of one namespace, and the outcomes of all its environments.
 
-    def __init__(self, page: LivePage, panel: str, threshold: float) -> None:
+    Args:
+        panel: its name on the page.
+        threshold: of the done signal, above which an imagined episode ends; None: not known.
+    """
+
+    def __init__(self, page: LivePage, panel: str, threshold: float | None) -> None:
         self._page, self._panel = page, panel
         self.about: dict[str, Any] = {"kind": "", "threshold": threshold, "steps": 1, "end": "", "behaviour": ""}
         self.size = (0, 0)
@@ -154,7 +159,7 @@ class Feed:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._page, self._folder, self._namespace, self._clock = page, folder, namespace, clock
-        self._threshold = 0.5 if folder is None else folder.threshold
+        self._threshold = None if folder is None else folder.threshold
         self._streams: dict[str, Stream] = {}
         self._points: Points = {}
         self._update = 0

@@ -78,9 +78,10 @@ class RunFolder:
         return self._clips[context] if context < len(self._clips) else None
 
     @property
-    def threshold(self) -> float:
-        """Of the done signal, above which an imagined episode ends."""
-        return float(self.settings.get("reward", {}).get("success_threshold", 0.5))
+    def threshold(self) -> float | None:
+        """Of the done signal, above which an imagined episode ends; None where the run has none."""
+        value = self.settings.get("reward", {}).get("success_threshold")
+        return None if value is None else float(value)
 
     def show(self, page: LivePage) -> None:
         """Show what has changed since the last call. Raises whatever files make that are not of a run."""
