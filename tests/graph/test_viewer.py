@@ -20,7 +20,7 @@ from wm_nodes.launching.graph import NodeSpec
 from wm_nodes.launching.runner import Runner
 from wm_nodes.reports.live_page import LivePage
 
-pytestmark = [pytest.mark.graph, pytest.mark.kills]
+pytestmark = [pytest.mark.graph, pytest.mark.kills, pytest.mark.slow]
 NODES = {f"/wm/{name}" for name in ("environment", "policy", "reward_evaluator", "learner")}
 
 
