@@ -45,6 +45,7 @@ GROUPS = {
     },
     "recordings": {
         "collect": "episodes of tasks in the simulator, planned and scripted",
+        "view": "a recording, or a run, on a live page of this host",
         "rescore": "score a recording again, compare bit for bit",
         "retrain": "train a video model again on a run's recorded clips and scores",
         "recover-bag": "bring back a recording whose process was killed",

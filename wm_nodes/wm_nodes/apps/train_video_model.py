@@ -77,6 +77,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     options.add_judge(parser)
     options.add_tensorboard(parser)
+    options.add_view(parser)
     options.add_graph(parser)
     parser.set_defaults(**dict.fromkeys(["preset", "from_scratch", *FREE]))
 
@@ -84,6 +85,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Take or record episodes, take or train a video model, run GRPO over the graph, measure, report."""
     options.prepare_torch()
+    options.take_port(arguments)
     with opened(arguments) as (config, run_dir):
         _run(arguments, config, run_dir)
 
@@ -161,7 +163,7 @@ def _post_train(
         "bag_uri": str(run_dir / "bags" / f"world_model_rl_{time.strftime('%Y%m%d_%H%M%S')}"),
         "video_model_dir": str(run_dir / "video_model"), "context_bags": contexts, "heldout_bags": heldout,
         "keep_buffers": str(arguments.keep_buffers), "tensorboard": "true" if arguments.tensorboard else "false",
-        "domain_id": arguments.domain_id,
+        "domain_id": arguments.domain_id, **arguments.view,
     })
     stage("starting the graph: " + ", ".join(node.label for node in graph.nodes))
     with Runner(graph, log_dir=run_dir / "logs", log=sys.stdout if arguments.verbose else None) as runner:
