@@ -2,6 +2,8 @@
 trained in a model of them: recorded by the graph, modelled from the recording, trained in over DDS."""
 
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -148,6 +150,23 @@ def test_one_ppo_update_in_the_model_runs_over_dds(
     assert not any(codes.values()), codes
     made = {path.name: path.read_bytes() for path in (graph.folder / "policies").glob("*.safetensors")}
     assert made["policy_000001.safetensors"] != made["policy_000002.safetensors"]
+
+
+@of_the_arm
+def test_the_example_records_an_environment_through_the_graph(
+    config: RunConfig, ros_domain: int, tmp_path: Path
+) -> None:
+    settings = [word for name, value in OWN["arm"].items() for word in (f"--{name}", str(value))]
+    done = subprocess.run(
+        [sys.executable, "-m", "examples.record", str(tmp_path / "bag"), *settings, "--policy.factory", UNTRAINED,
+         "--steps", "20", "--num-envs", "2", "--domain-id", str(ros_domain)],
+        capture_output=True, encoding="utf-8", timeout=200, check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    episodes = [*read_episodes(tmp_path / "bag", expected=configured_spec(config))]
+    ended = [episode for episode in episodes if episode.terminated or episode.truncated]
+    won = sum(episode.success.any() for episode in ended)
+    assert f"{len(ended)} episodes, {won} succeed" in done.stdout and len(ended) >= 4
 
 
 @of_the_arm

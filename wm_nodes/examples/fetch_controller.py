@@ -28,7 +28,7 @@ def reach(config: RunConfig) -> Reach:
     def ball(images_BHWC: Tensor) -> Tensor:
         """Where (B, 3) the lines of sight of the red pixels' middles meet; the middle of the view pulls a little."""
         matrix, vector = 0.01 * torch.eye(3), 0.01 * torch.tensor(views[0].lookat_m)
-        for view, picture in zip(views, images_BHWC.int().split(width, 2), strict=True):
+        for view, picture in zip(views, torch.split(images_BHWC.int(), width, 2), strict=True):
             a, e = np.radians([view.azimuth_deg, view.elevation_deg])
             ahead = torch.tensor([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)]).float()
             up = torch.tensor([-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e)]).float()
@@ -41,7 +41,8 @@ def reach(config: RunConfig) -> Reach:
             sight = torch.nn.functional.normalize(sight, dim=1)
             across = (torch.eye(3) - sight[:, :, None] * sight[:, None]) * (seen > 0)[:, None, None]
             matrix, vector = matrix + across, vector + across @ (torch.tensor(view.lookat_m) - view.distance_m * ahead)
-        return torch.linalg.solve(matrix, vector)
+        place_B3: Tensor = torch.linalg.solve(matrix, vector)
+        return place_B3
 
     return Reach(ImageEncoder(ball, 3), 3, 4, config.policy, seed=config.seed)
 

@@ -11,6 +11,7 @@ import examples
 from wm_nodes.config.tasks import VARIABLE, get_task, task_names
 
 NAMES = ("own_environment", "own_learner", "own_policy", "own_reward", "own_task")
+IN_GYMNASIUM = ("imagined_ppo", "imagined_sb3")
 FOLDER = Path(str(examples.__file__)).parent
 
 
@@ -34,6 +35,16 @@ def test_an_example_is_trained_with_by_its_command(
     run_command(name, monkeypatch, tmp_path)
     kind = "real" if name == "own_environment" else "imagined"
     assert len(re.findall(rf"version \d+: {kind} success \d", capsys.readouterr().out)) == 3
+
+
+@pytest.mark.parametrize("name", IN_GYMNASIUM)
+def test_a_foreign_algorithm_trains_in_the_world_model_by_its_command(
+    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if name == "imagined_sb3":
+        pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is in requirements/gym.txt")
+    run_command(name, monkeypatch, tmp_path)
+    assert len(re.findall(r"update \d+: imagined success \d", capsys.readouterr().out)) == 3
 
 
 @pytest.mark.rendering
