@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import drawn_pendulum
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -23,6 +24,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.specs import SpecMismatch, agree
 from wm_nodes.environments.registry import configured_spec
 from wm_nodes.policy_rl.factories import UNTRAINED, make_imagined_environment, make_policy
+from wm_nodes.policy_rl.gym import ID
 from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.recording import read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import stack_episodes
@@ -122,6 +124,16 @@ def test_it_imagines_how_measured_joints_move_and_not_what_the_action_asked_for(
     with torch.inference_mode():
         device.step(torch.from_numpy(action))
     np.testing.assert_allclose(device.states_NP.numpy(), imagined.current().state, atol=1e-6)
+
+
+@of_the_arm
+def test_the_model_is_an_environment_of_gymnasium_without_a_task(model_dir: Path) -> None:
+    envs = gymnasium.make_vec(ID, 2, model_dir=model_dir)
+    shown, _ = envs.reset(seed=0)
+    assert envs.observation_space.contains(shown)
+    assert (shown["image"].shape, shown["state"].shape) == ((2, 72, 96, 3), (2, 6))
+    following, rewards, *_ = envs.step(np.full((2, 6), 0.5, np.float32))
+    assert rewards.shape == (2,) and (following["state"] != shown["state"]).all()
 
 
 def test_acceptance_judges_the_done_signal_and_says_that_it_cannot_judge_positions(
