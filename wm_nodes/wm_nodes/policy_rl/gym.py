@@ -1,7 +1,7 @@
 """The world model as Gymnasium environments, wm_nodes/Imagined-v0; importing this module registers them.
 
     envs = gymnasium.make_vec("wm_nodes.policy_rl.gym:wm_nodes/Imagined-v0", num_envs=64, model_dir="runs/mine/model")
-    env = gymnasium.make("wm_nodes.policy_rl.gym:wm_nodes/Imagined-v0", task="push_cube")
+    env = gymnasium.make("wm_nodes.policy_rl.gym:wm_nodes/Imagined-v0", model_dir="runs/mine/model")
 
 environments/gym.py has the real tasks. examples/imagined_*.py train in this. Shapes: N environments, A action, S state,
 H W 3 image.
