@@ -36,7 +36,7 @@ def config_of(task: str) -> RunConfig:
 OWN = {
     "arm": {"task": "", "environment.factory": f"{__name__}:make_real_arm"},
     "pendulum": {**PENDULUM, "gymnasium.kwargs": {"max_episode_steps": LIMIT}},
-    "fetch_reach": {"gymnasium.kwargs": {"max_episode_steps": LIMIT}},
+    **{preset: {"gymnasium.kwargs": {"max_episode_steps": LIMIT}} for preset in ("fetch_reach", "fetch_push")},
 }
 CONFIGS = {"": config_of("push_cube"), " of poses": config_of("push")}
 
@@ -84,8 +84,8 @@ def make(request: pytest.FixtureRequest, models: dict[str, WorldModels]) -> Iter
     def build(seed: int) -> Environment:
         environment: Environment
         if name in OWN:
-            if name == "fetch_reach" and find_spec("gymnasium_robotics") is None:
-                pytest.skip("FetchReach needs requirements/gym.txt")
+            if name.startswith("fetch") and find_spec("gymnasium_robotics") is None:
+                pytest.skip("the Fetch robot needs requirements/gym.txt")
             settings = load_config(name if name in preset_names() else "smoke", OWN[name])
             environment = make_environment(settings, settings.environment.factory, num_envs=N, seed=seed)
         elif name == "maniskill":
