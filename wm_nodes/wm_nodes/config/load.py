@@ -24,7 +24,7 @@ PRESETS = resources.files("wm_nodes.config") / "presets"
 POLICY, VIDEO = "policy", "video"
 """Folders of presets, one for each loop."""
 SCHEMAS: dict[str, type[RunConfig] | type[VideoRlConfig]] = {POLICY: RunConfig, VIDEO: VideoRlConfig}
-FREE = ("behaviours", "rewards", "extra_body", "kwargs")
+FREE = ("behaviours", "rewards", "extra_body", "kwargs", "cameras")
 """Mappings without fixed keys, which are replaced as a whole."""
 RECORD = "run"
 """Section of a run's config.yaml that is no setting: training/run_record.py keeps there what else decides the run."""
