@@ -74,6 +74,9 @@ class DataConfig(SettingsSection):
     before its success."""
     policy_episodes: Annotated[int, Field(ge=0, le=10_000)]
     """Episodes of each weak cloned policy (policy_rl/pretraining.py) added to the world model's data; 0: none."""
+    ground_truth: bool
+    """False: wm train-model leaves the ground truth of recordings unread. Nothing is then supervised by positions, the
+    policy sees none, and the model is judged by its pictures and done signal; success is the flag that was recorded."""
 
 
 class TokenizerConfig(SettingsSection):
