@@ -79,7 +79,8 @@ def test_such_a_model_is_judged_by_pictures_also_where_the_simulator_knows_posit
     config = settings(False, task="push_cube")
     report = accept_world_model(models, load_arrays([bag], config, models.tasks), config)
     assert "Positions were not judged: no ground truth names them." in report.notes
-    assert any(row.name.startswith("feature distance") for row in report.criteria)
+    (row,) = (row for row in report.criteria if row.name.startswith("varying pixels, unexplained, step"))
+    assert row.outcome == "failed", "twenty iterations show no square"
 
 
 def test_what_compares_or_collects_by_positions_refuses_with_the_remedy(bag: Path, tmp_path: Path) -> None:

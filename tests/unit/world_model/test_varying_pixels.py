@@ -41,3 +41,8 @@ def test_pixels_that_are_alike_in_all_episodes_count_for_nothing() -> None:
     noisy[:, 15:] += np.random.default_rng(0).integers(0, 60, noisy[:, 15:].shape, dtype=np.uint8)
     assert varying_error(noisy, recorded()) == 0
     assert np.isnan(varying_error(noisy[:, 15:], recorded()[:, 15:]))
+
+
+def test_few_episodes_decide_nothing() -> None:
+    assert np.isfinite(varying_error(recorded()[:24], recorded()[:24]))
+    assert np.isnan(varying_error(recorded()[:23], recorded()[:23]))

@@ -102,8 +102,11 @@ class TokenizerConfig(SettingsSection):
     """Weight of the loss that keeps the encoder's output near its code; lfq only."""
     foreground_weight: NonNegativeFloat
     """Extra weight of foreground pixels."""
+    worst_weight: NonNegativeFloat = 0.0
+    """Without ground truth: weight of the loss of each frame's worst pixels, against losing small things."""
     probe_weight: NonNegativeFloat = 0.1
-    """Weight of the loss of the positions that a probe reads off the latents."""
+    """Weight of the loss of the positions that a probe reads off the latents; without ground truth, of the action and
+    the success that were recorded with the frame."""
     probe_depth: PositiveInt = 1
     """Hidden layers of the probe."""
     probe_iterations: NonNegativeInt = 0

@@ -23,7 +23,13 @@ from wm_nodes.world_model.positions import judged_things
 from wm_nodes.world_model.validation.acceptance_report import AcceptanceReport, Criterion, Outcome, at_step, number_of
 from wm_nodes.world_model.validation.goals import goal_metrics
 from wm_nodes.world_model.validation.open_loop import MOVED_M, evaluate_rollouts
-from wm_nodes.world_model.validation.pictures import horizons_of, judged_horizon, picture_metrics, worst_varying_step
+from wm_nodes.world_model.validation.pictures import (
+    ENOUGH,
+    horizons_of,
+    judged_horizon,
+    picture_metrics,
+    worst_varying_step,
+)
 
 MORE_TRAINING = (
     "train longer (world_model.num_iterations) or on more episodes near contact (data.num_episodes, data.behaviours)"
@@ -144,7 +150,8 @@ def _picture_criteria(
         name, value = f"varying pixels, unexplained, step {worst}", at_step(metrics, "varying_error", worst)
         criteria.append(_below(name, value, config.acceptance.varying_error_ratio, None, LOST_THINGS))
     else:
-        notes.append("What the tokenizer loses was not judged: the pictures of the episodes do not differ.")
+        notes.append(f"What the tokenizer loses was not judged: fewer than {ENOUGH} episodes are held out, or their "
+                     "pictures do not differ.")
     if step < num_steps:
         notes.append(f"Pictures were judged up to step {step}, which half of the held-out episodes reach; imagined "
                      f"episodes have up to {num_steps}.")

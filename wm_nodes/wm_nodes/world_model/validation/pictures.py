@@ -28,6 +28,8 @@ VARIES = 0.04
 """A pixel varies between episodes whose standard deviation, of [0, 1], is above this: less may be noise."""
 WORST = 0.9
 """Quantile of the varying pixels: the tenth that is shown worst."""
+ENOUGH = 24
+"""Episodes whose variance per pixel says something: of 8, good models fail."""
 SAME_ACTION = 1e-3
 """Two episodes whose actions differ by less than this on average show nothing of what actions do."""
 
@@ -77,7 +79,7 @@ def picture_metrics(models: WorldModels, episodes: EpisodeArrays) -> dict[str, f
 
 def varying_error(frames: UInt8Array, recorded: UInt8Array) -> float:
     """Squared error of frames (E, H, W, 3) over the variance of the recorded ones, per pixel; of the pixels that vary,
-    the quantile WORST; NaN where none varies.
+    the quantile WORST; NaN where none varies, or of fewer than ENOUGH episodes.
 
     0 shows all that differs between the episodes, 1 no more than their mean frame does. Each pixel counts by its own
     variance, so that a small thing counts beside a large one.
@@ -85,7 +87,9 @@ def varying_error(frames: UInt8Array, recorded: UInt8Array) -> float:
     real, shown = (images.reshape(len(images), -1, 3).astype(np.float32) / 255 for images in (recorded, frames))
     errors_N, variances_N = np.square(shown - real).mean((0, -1)), real.var(0).mean(-1)
     varies = variances_N > VARIES**2
-    return float(np.quantile(errors_N[varies] / variances_N[varies], WORST)) if varies.any() else float("nan")
+    if len(real) < ENOUGH or not varies.any():
+        return float("nan")
+    return float(np.quantile(errors_N[varies] / variances_N[varies], WORST))
 
 
 def horizons_of(metrics: Mapping[str, float | None]) -> list[int]:
