@@ -38,7 +38,7 @@ OPTIONS = {
     "judge hack": "clips --config --device --judge --judge-model --judge-key-env --rubric --least --limit "
     "--limit-clips --seed --reads --json --pictures",
     "audit": "verify recover sample view agree people replay",
-    **{f"benchmark {name}": "--json" for name in EXPERIMENTS},
+    **{f"benchmark {name}": "--json" for name in EXPERIMENTS}, "benchmark tables": "--check --docs",
 }
 
 

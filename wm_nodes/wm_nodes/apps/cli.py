@@ -76,6 +76,7 @@ GROUPS = {
         "benchmark closed-loop": "a video model that goes on from its own frames, with controls",
         "benchmark erring": "the reward agent under a judge that errs",
         "benchmark success-clips": "any judge on other people's labelled episodes",
+        "benchmark tables": "the full tables of the result pages, from the result files",
     },
 }
 VERBS = {name: about for verbs in GROUPS.values() for name, about in verbs.items()}
