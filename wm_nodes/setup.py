@@ -1,5 +1,8 @@
 """Build of the package wm_nodes, by pip and by colcon. Versions of what it needs are pinned in ../requirements."""
 
+import re
+from pathlib import Path
+
 from setuptools import find_packages, setup
 
 NODES = (
@@ -10,9 +13,12 @@ NODES = (
 KINDS = ("xml", "yaml", "json", "jsonl", "css", "html", "js", "safetensors", "txt", "png")
 """Of data files."""
 
+HEAD = (Path(__file__).with_name("wm_nodes") / "__init__.py").read_text(encoding="utf-8")
+VERSION = re.search('__version__ = "(.+)"', HEAD)
+
 setup(
     name="wm_nodes",
-    version="0.1.0",
+    version=VERSION[1],
     description="Online world-model reinforcement learning as a ROS 2 graph",
     license="Apache-2.0",
     python_requires=">=3.11,<3.13",

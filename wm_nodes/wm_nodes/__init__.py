@@ -1,3 +1,3 @@
 """Online world-model RL as a ROS 2 graph."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from rich.console import Console
 
 from wm_nodes.reports.clip_report import (
@@ -24,7 +25,7 @@ from wm_nodes.reports.clip_report import (
     write_clip_report,
 )
 from wm_nodes.reports.curves import Panel, curves, read_series
-from wm_nodes.reports.film_strip import film_strip
+from wm_nodes.reports.film_strip import STEP_MS, film_strip, moving_picture
 from wm_nodes.reports.html import Picture, write_report
 from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reports.summary import (
@@ -127,6 +128,25 @@ def test_a_goal_of_one_frame_stands_under_the_last_column_and_short_rows_stay_em
                (("last", (42, 40, 40)), ("goal", (140, 140, 140)))}
     np.testing.assert_array_equal(columns["last"], columns["goal"])
     assert not blocks_of(picture, (92, 90, 90))
+
+
+def test_a_moving_picture_plays_episodes_beside_each_other_and_keeps_the_last_frame_of_one_that_ended(
+    tmp_path: Path,
+) -> None:
+    blue, red = (np.zeros((3, 8, 10, 3), np.uint8) for _ in range(2))
+    blue[..., 2], red[..., 0] = (np.array([100, 170, 240])[:, None, None] for _ in range(2))
+    episodes = [{"real": blue, "imagined": blue}, {"real": red[:2], "imagined": red[:2]}]
+    moving_picture(episodes, tmp_path / "moving.gif", scale=4, marks=[{"imagined": 1}, {}])
+    with Image.open(tmp_path / "moving.gif") as moving:
+        assert moving.n_frames == 3 and moving.info["loop"] == 0 and moving.info["duration"] == STEP_MS
+        for step, frames_of in enumerate(((blue[0], red[0]), (blue[1], red[1]), (blue[2], red[1]))):
+            moving.seek(step)
+            shown = np.asarray(moving.convert("RGB")).astype(int)
+            areas = [(np.abs(shown - frame[0, 0]) < 12).all(-1).sum() for frame in frames_of]
+            green = (np.abs(shown - (30, 170, 80)) < 12).all(-1).any()
+            assert min(areas) > 0.8 * 2 * 8 * 10 * 16 and green == (step >= 1), step
+    with pytest.raises(ValueError, match="at least one episode"):
+        moving_picture([], tmp_path / "none.gif")
 
 
 @pytest.mark.parametrize(
@@ -285,12 +305,14 @@ class _Page(HTMLParser):
 
 def test_the_report_is_one_file_with_its_pictures_inside(tmp_path: Path) -> None:
     film_strip({"real": frames(3)}, tmp_path / "strip.png")
-    path = write_report(tmp_path, SUMMARY, [Picture("Strip", "what", tmp_path / "strip.png")], config_text="seed: 3")
+    moving_picture([{"real": frames(3)}], tmp_path / "moving.gif")
+    pictures = [Picture(name, "what", tmp_path / name) for name in ("strip.png", "moving.gif")]
+    path = write_report(tmp_path, SUMMARY, pictures, config_text="seed: 3")
     text = path.read_text()
     page = _Page()
     page.feed(text)
     assert not page.open
-    assert len(page.sources) == 1 and page.sources[0].startswith("data:image/png;base64,")
+    assert [source.split(",")[0] for source in page.sources] == ["data:image/png;base64", "data:image/gif;base64"]
     assert not re.search(r"https?://|<script", text)
     for part in ("got better", "64 / 200", "recall", "more data", "undefined", SUMMARY.bag, "seed: 3",
                  "--task &lt;x&gt;", "P &amp; Q", "a note"):

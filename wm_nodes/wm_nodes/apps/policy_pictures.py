@@ -17,7 +17,7 @@ from wm_nodes.policy_rl.factories import models_of
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.reports.curves import curves
-from wm_nodes.reports.film_strip import film_strip
+from wm_nodes.reports.film_strip import film_strip, moving_picture
 from wm_nodes.reports.html import Picture
 from wm_nodes.training.metrics import FILE_NAME
 from wm_nodes.world_model import WorldModels
@@ -25,6 +25,7 @@ from wm_nodes.world_model.text import imagine_goals
 from wm_nodes.world_model.validation.open_loop import imagine_episodes
 
 NUM_STRIPS = 2
+MOVING = "real_and_imagined.gif"
 
 
 @dataclass(frozen=True)
@@ -44,13 +45,24 @@ class SideBySide:
     signals: FloatArray
     """float32 (T,), the done signal of imagined frames 1..T."""
 
+    @property
+    def rows(self) -> dict[str, UInt8Array]:
+        """As a film strip shows them."""
+        return {"real": self.real, "imagined": self.imagined}
+
+    @property
+    def done(self) -> dict[str, int]:
+        """Label to the first frame that is done, of rows that have one."""
+        first = {"real": self.real_done, "imagined": self.imagined_done}
+        return {name: step for name, step in first.items() if step >= 0}
+
 
 def write_pictures(
     run_dir: Path, config: RunConfig, model_dir: Path, policy: ImagePolicy, first_seed: int
 ) -> list[Picture]:
     """Play NUM_STRIPS episodes of the policy in the simulator, imagine the same actions, and draw both; and the curves.
 
-    Writes PNGs to <run_dir>/pictures.
+    Writes PNGs and a GIF to <run_dir>/pictures.
     """
     environment = make_environment(config, config.evaluation.environment, num_envs=1, seed=config.seed)
     try:
@@ -58,11 +70,14 @@ def write_pictures(
     finally:
         environment.close()
     folder, pictures = run_dir / "pictures", list[Picture]()
-    for index, pair in enumerate(side_by_side(models_of(Path(model_dir), config.device), episodes, config)):
+    pairs = side_by_side(models_of(Path(model_dir), config.device), episodes, config)
+    moving = Picture("Real and imagined", "The episodes below, as they pass.", folder / MOVING)
+    moving_picture([pair.rows for pair in pairs], moving.path, marks=[pair.done for pair in pairs])
+    pictures.append(moving)
+    for index, pair in enumerate(pairs):
         path = folder / f"film_strip_{index}.png"
-        rows = {"real": pair.real, "imagined": pair.imagined} | ({} if pair.goal is None else {"goal": pair.goal[None]})
-        done = {"real": pair.real_done, "imagined": pair.imagined_done}
-        film_strip(rows, path, marks={name: step for name, step in done.items() if step >= 0})
+        rows = pair.rows | ({} if pair.goal is None else {"goal": pair.goal[None]})
+        film_strip(rows, path, marks=pair.done)
         pictures.append(Picture(f"Real and imagined, episode {index + 1}", describe(pair, first_seed + index), path))
     drawn = curves(run_dir / FILE_NAME, folder / "curves.png")
     if drawn is not None:

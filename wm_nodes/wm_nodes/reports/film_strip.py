@@ -1,6 +1,7 @@
-"""Episodes as a picture: one row per label, time from left to right. Shapes: T frames, H W 3 image."""
+"""Episodes as a picture: one row per label, time from left to right, or as it passes. Shapes: T frames, H W 3 image."""
 
-from collections.abc import Iterable, Mapping
+import io
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,8 @@ from wm_nodes.core.types import UInt8Array
 INK, FAINT, PAPER = (32, 32, 36), (120, 120, 128), 255
 GAP_PX, HEADER_PX, FONT = 6, 26, cv2.FONT_HERSHEY_SIMPLEX
 LABEL_SCALE, STEP_SCALE = 0.6, 0.5
+STEP_MS, END_MS = 350, 2000
+"""How long a moving picture shows a step, and its last one."""
 
 
 def film_strip(
@@ -38,29 +41,85 @@ def film_strip(
     _check(rows)
     if scale < 1 or max_columns < 2:
         raise ValueError(f"scale must be >= 1 and max_columns >= 2, got {scale} and {max_columns}")
-    height, width = (side * scale for side in next(iter(rows.values())).shape[1:3])
     steps = _shown_steps(max(len(frames) for frames in rows.values()), max_columns, (marks or {}).values())
-    left = 16 + max(cv2.getTextSize(label, FONT, LABEL_SCALE, 1)[0][0] for label in rows)
-    shape = (HEADER_PX + len(rows) * (height + GAP_PX), left + len(steps) * (width + GAP_PX), 3)
-    picture = np.full(shape, PAPER, np.uint8)
-    for column, step in enumerate(steps):
-        x = left + column * (width + GAP_PX)
-        text = f"step {step}" if column == 0 else str(step)
-        cv2.putText(picture, text, (x + 2, HEADER_PX - 9), FONT, STEP_SCALE, FAINT, 1, cv2.LINE_AA)
-    for index, (label, frames) in enumerate(rows.items()):
-        y = HEADER_PX + index * (height + GAP_PX)
-        cv2.putText(picture, label, (6, y + height // 2 + 6), FONT, LABEL_SCALE, INK, 1, cv2.LINE_AA)
-        for column, step in enumerate(steps):
-            is_goal = len(frames) == 1
-            if (column < len(steps) - 1) if is_goal else step >= len(frames):
-                continue
-            x = left + column * (width + GAP_PX)
-            frame = frames[0 if is_goal else step]
-            picture[y : y + height, x : x + width] = frame.repeat(scale, 0).repeat(scale, 1)
-            if marks and marks.get(label) == step:
-                cv2.rectangle(picture, (x, y), (x + width - 1, y + height - 1), (30, 170, 80), 3)
+    cells = dict[str, list[UInt8Array | None]]()
+    for label, frames in rows.items():
+        if len(frames) == 1:  # a goal
+            cells[label] = [None] * (len(steps) - 1) + [frames[0]]
+        else:
+            cells[label] = [frames[step] if step < len(frames) else None for step in steps]
+    headers = [f"step {step}" if column == 0 else str(step) for column, step in enumerate(steps)]
+    done = {(label, steps.index(step)) for label, step in (marks or {}).items() if label in rows and step in steps}
+    picture = _sheet(cells, headers, done, scale)
     if path is not None:
         write_atomic(path, cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
+    return picture
+
+
+def moving_picture(
+    episodes: Sequence[Mapping[str, UInt8Array]], path: Path, *, scale: int = 3,
+    marks: Sequence[Mapping[str, int]] = (),
+) -> None:
+    """Write a GIF of several episodes beside each other, a row per label, played together and again and again.
+
+    Args:
+        episodes: each as the rows of a film strip, all with the same labels; one that has ended keeps its last frame.
+        path: of the GIF.
+        scale: enlargement of every pixel.
+        marks: of each episode, label to the step at which the row's signal said "done"; from there on the frame is
+            green.
+
+    Raises:
+        ValueError: as film_strip.
+    """
+    from PIL import Image
+
+    for rows in episodes:
+        _check(rows)
+    lasts = [max(map(len, rows.values())) - 1 for rows in episodes]
+    sheets = []
+    for step in range(max(lasts, default=-1) + 1):
+        cells = {
+            label: [rows[label][min(step, len(rows[label]) - 1)] for rows in episodes] for label in episodes[0]
+        }
+        done = {
+            (label, column) for column, its in enumerate(marks) for label, first in its.items() if step >= first
+        }
+        sheets.append(_sheet(cells, [f"step {min(step, last)}" for last in lasts], done, scale))
+    if not sheets:
+        raise ValueError("a moving picture needs at least one episode")
+    palette = Image.fromarray(np.concatenate(sheets)).quantize(256)
+    first, *others = [Image.fromarray(sheet).quantize(palette=palette, dither=Image.Dither.NONE) for sheet in sheets]
+    data = io.BytesIO()
+    first.save(
+        data, "GIF", save_all=True, append_images=others, loop=0, duration=[STEP_MS] * len(others) + [END_MS]
+    )
+    write_atomic(path, data.getvalue())
+
+
+def _sheet(
+    cells: Mapping[str, Sequence[UInt8Array | None]], headers: Sequence[str], done: Collection[tuple[str, int]],
+    scale: int,
+) -> UInt8Array:
+    """Frames in rows with their labels left, one of `headers` above each column, and a green frame around cells in
+    `done`. None stays empty."""
+    height, width = (side * scale for side in next(f for row in cells.values() for f in row if f is not None).shape[:2])
+    left = 16 + max(cv2.getTextSize(label, FONT, LABEL_SCALE, 1)[0][0] for label in cells)
+    shape = (HEADER_PX + len(cells) * (height + GAP_PX), left + len(headers) * (width + GAP_PX), 3)
+    picture = np.full(shape, PAPER, np.uint8)
+    for column, text in enumerate(headers):
+        x = left + column * (width + GAP_PX)
+        cv2.putText(picture, text, (x + 2, HEADER_PX - 9), FONT, STEP_SCALE, FAINT, 1, cv2.LINE_AA)
+    for index, (label, frames) in enumerate(cells.items()):
+        y = HEADER_PX + index * (height + GAP_PX)
+        cv2.putText(picture, label, (6, y + height // 2 + 6), FONT, LABEL_SCALE, INK, 1, cv2.LINE_AA)
+        for column, frame in enumerate(frames):
+            if frame is None:
+                continue
+            x = left + column * (width + GAP_PX)
+            picture[y : y + height, x : x + width] = frame.repeat(scale, 0).repeat(scale, 1)
+            if (label, column) in done:
+                cv2.rectangle(picture, (x, y), (x + width - 1, y + height - 1), (30, 170, 80), 3)
     return picture
 
 

@@ -25,7 +25,7 @@ MARKS = {"passed": "good", "failed": "bad", "undecided": "faint"}
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG of the report."""
+    """A PNG or GIF of the report."""
 
     title: str
     """Above it."""
