@@ -1,7 +1,7 @@
 """A real browser for tests: Chromium over the two pipes of its debugging protocol; needs no package of Python's.
 
-Pages are loaded from files, keys are pressed as a person presses them (Input.dispatchKeyEvent), downloads land in a
-folder. https://chromedevtools.github.io/devtools-protocol/
+Pages are loaded from files or a server, keys are pressed as a person presses them (Input.dispatchKeyEvent), downloads
+land in a folder. https://chromedevtools.github.io/devtools-protocol/
 """
 
 import base64
@@ -64,9 +64,9 @@ class Page:
                 return result
             self.events.append(answer)
 
-    def open(self, path: Path) -> None:
-        """Load a file and wait until it is complete."""
-        self.call("Page.navigate", url=path.resolve().as_uri())
+    def open(self, place: Path | str) -> None:
+        """Load a file, or what is at a URL, and wait until it is complete."""
+        self.call("Page.navigate", url=place.resolve().as_uri() if isinstance(place, Path) else place)
         self.until("document.readyState === 'complete'")
 
     def js(self, expression: str) -> Any:

@@ -145,7 +145,6 @@ def toy_buffer(
         group_ids=torch.arange(groups).repeat_interleave(size),
         sample_ids=torch.arange(size).repeat(groups),
         rewards={},
-        valid=torch.zeros(groups * size, dtype=torch.bool),
         policy_version=version,
         iteration=iteration,
         config_hash=config_hash(settings),

@@ -7,7 +7,7 @@ from setuptools import find_packages, setup
 
 NODES = (
     "environment", "policy", "reward_evaluator", "learner", "recorder", "player", "evaluation",
-    "video_model", "clip_evaluator", "video_learner",
+    "video_model", "clip_evaluator", "video_learner", "viewer",
 )
 
 KINDS = ("xml", "yaml", "json", "jsonl", "css", "html", "js", "safetensors", "txt", "png")

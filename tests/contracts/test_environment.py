@@ -4,6 +4,7 @@ else's: an arm of a file, and one of Gymnasium."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from model_folders import make_model_folder
 
 from benchmarks.speed.noop_environment import NoopEnvironment
 from examples import own_environment
-from wm_nodes.config.load import load_config
+from wm_nodes.config.load import load_config, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import SOURCE_REAL
@@ -35,6 +36,7 @@ def config_of(task: str) -> RunConfig:
 OWN = {
     "arm": {"task": "", "environment.factory": f"{__name__}:make_real_arm"},
     "pendulum": {**PENDULUM, "gymnasium.kwargs": {"max_episode_steps": LIMIT}},
+    **{preset: {"gymnasium.kwargs": {"max_episode_steps": LIMIT}} for preset in ("fetch_reach", "fetch_push")},
 }
 CONFIGS = {"": config_of("push_cube"), " of poses": config_of("push")}
 
@@ -82,7 +84,9 @@ def make(request: pytest.FixtureRequest, models: dict[str, WorldModels]) -> Iter
     def build(seed: int) -> Environment:
         environment: Environment
         if name in OWN:
-            settings = load_config("smoke", OWN[name])
+            if name.startswith("fetch") and find_spec("gymnasium_robotics") is None:
+                pytest.skip("the Fetch robot needs requirements/gym.txt")
+            settings = load_config(name if name in preset_names() else "smoke", OWN[name])
             environment = make_environment(settings, settings.environment.factory, num_envs=N, seed=seed)
         elif name == "maniskill":
             environment = make_simulator(config, seed)

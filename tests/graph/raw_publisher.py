@@ -38,6 +38,7 @@ _RMW.rmw_create_publisher.argtypes = [
     ctypes.c_void_p, ctypes.c_void_p, ctypes.c_char_p, ctypes.POINTER(_Qos), ctypes.POINTER(_Options)
 ]
 _RMW.rmw_publish_serialized_message.argtypes = [ctypes.c_void_p, ctypes.POINTER(_Bytes), ctypes.c_void_p]
+_RMW.rmw_publisher_wait_for_all_acked.argtypes = [ctypes.c_void_p, _Time]
 _RMW.rmw_destroy_publisher.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
 _POINTER, _NAME = ctypes.pythonapi.PyCapsule_GetPointer, ctypes.pythonapi.PyCapsule_GetName
 _POINTER.restype, _POINTER.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
@@ -67,4 +68,6 @@ class RawPublisher:
         _RMW.rmw_publish_serialized_message(self._publisher, ctypes.byref(message), None)  # refuses what is too long
 
     def destroy(self) -> None:
+        """What was published has arrived by then, unless a reader is away for more than 5 s."""
+        _RMW.rmw_publisher_wait_for_all_acked(self._publisher, _Time(5, 0))
         _RMW.rmw_destroy_publisher(self._node, self._publisher)

@@ -2,10 +2,13 @@
 trained in a model of them: recorded by the graph, modelled from the recording, trained in over DDS."""
 
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import drawn_pendulum
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -21,6 +24,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.specs import SpecMismatch, agree
 from wm_nodes.environments.registry import configured_spec
 from wm_nodes.policy_rl.factories import UNTRAINED, make_imagined_environment, make_policy
+from wm_nodes.policy_rl.gym import ID
 from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.recording import read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import stack_episodes
@@ -122,6 +126,16 @@ def test_it_imagines_how_measured_joints_move_and_not_what_the_action_asked_for(
     np.testing.assert_allclose(device.states_NP.numpy(), imagined.current().state, atol=1e-6)
 
 
+@of_the_arm
+def test_the_model_is_an_environment_of_gymnasium_without_a_task(model_dir: Path) -> None:
+    envs = gymnasium.make_vec(ID, 2, model_dir=model_dir)
+    shown, _ = envs.reset(seed=0)
+    assert envs.observation_space.contains(shown)
+    assert (shown["image"].shape, shown["state"].shape) == ((2, 72, 96, 3), (2, 6))
+    following, rewards, *_ = envs.step(np.full((2, 6), 0.5, np.float32))
+    assert rewards.shape == (2,) and (following["state"] != shown["state"]).all()
+
+
 def test_acceptance_judges_the_done_signal_and_says_that_it_cannot_judge_positions(
     model_dir: Path, bag: Path, config: RunConfig
 ) -> None:
@@ -148,6 +162,23 @@ def test_one_ppo_update_in_the_model_runs_over_dds(
     assert not any(codes.values()), codes
     made = {path.name: path.read_bytes() for path in (graph.folder / "policies").glob("*.safetensors")}
     assert made["policy_000001.safetensors"] != made["policy_000002.safetensors"]
+
+
+@of_the_arm
+def test_the_example_records_an_environment_through_the_graph(
+    config: RunConfig, ros_domain: int, tmp_path: Path
+) -> None:
+    settings = [word for name, value in OWN["arm"].items() for word in (f"--{name}", str(value))]
+    done = subprocess.run(
+        [sys.executable, "-m", "examples.record", str(tmp_path / "bag"), *settings, "--policy.factory", UNTRAINED,
+         "--steps", "20", "--num-envs", "2", "--domain-id", str(ros_domain)],
+        capture_output=True, encoding="utf-8", timeout=200, check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    episodes = [*read_episodes(tmp_path / "bag", expected=configured_spec(config))]
+    ended = [episode for episode in episodes if episode.terminated or episode.truncated]
+    won = sum(episode.success.any() for episode in ended)
+    assert f"{len(ended)} episodes, {won} succeed" in done.stdout and len(ended) >= 4
 
 
 @of_the_arm

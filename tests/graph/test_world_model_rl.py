@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,17 +34,18 @@ from wm_nodes.training.run_lock import NAME
 from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_rl.execution_reward import EXECUTION_SCORES, load_execution_reward
 from wm_nodes.video_rl.recorded_buffers import RecordedClips, read_clips, rescore
 from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, ClipScores, load_probe
 from wm_nodes.video_rl.sampling import RecordedContexts
 from wm_nodes.video_rl.train import post_train, sample_buffers
-from wm_nodes.video_rl.training_run import CHECKPOINT, VIDEO_FILES, VideoRun, evaluated_uri, progress
+from wm_nodes.video_rl.training_run import CHECKPOINT, VIDEO_FILES, VideoRun, progress
 from wm_nodes.video_rl.validation import context_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
 pytestmark = pytest.mark.graph
 PROGRAM = "import sys; from wm_nodes.apps.cli import main; sys.exit(main(['train-video-model', *sys.argv[1:]]))"
-SETTINGS = {"grpo.ema_decay": 0.5, "rewards.closeness": 0.5}
+SETTINGS = {"rewards.closeness": 0.5, "rewards.execution": 0.5}
 ARGUMENTS = ["--preset", "smoke", *(f"--{name}={value}" for name, value in SETTINGS.items())]
 
 
@@ -94,8 +96,7 @@ def test_the_graph_gives_the_weights_of_video_rl_train_bit_for_bit(
     for buffer, _ in post_train(run, sample_buffers(source, run, config.iterations)):
         frames.append(folder.codec.decode(buffer.rollout.latents))
     run.close()
-    for uri in (VIDEO_FILES.uri(4), evaluated_uri(4, config)):
-        assert (tmp_path / uri).read_bytes() == (run_dir / uri).read_bytes()
+    assert (tmp_path / VIDEO_FILES.uri(4)).read_bytes() == (run_dir / VIDEO_FILES.uri(4)).read_bytes()
 
     with Bag(Path(read_summary(run_dir)["bag"])) as bag:
         types = {connection.topic: connection.msgtype for connection in bag.connections}
@@ -109,29 +110,29 @@ def test_the_graph_gives_the_weights_of_video_rl_train_bit_for_bit(
 
 
 @pytest.mark.slow
-def test_the_averaged_weights_are_measured_after_and_the_base_model_once_before(
+def test_the_newest_weights_are_measured_after_and_the_base_model_once_before(
     run_dir: Path, config: VideoRlConfig, probe: PositionProbe
 ) -> None:
     summary, folder = read_summary(run_dir), load_video_folder(run_dir / "video_model")
     before = json.loads((run_dir / "evaluations" / "before.json").read_text())
-    assert before["sha256"] == folder.manifest["sha256"]["network.safetensors"]
+    assert before["of"]["sha256"] == folder.manifest["sha256"]["network.safetensors"]
     for name, row in summary["scores"].items():
         assert row["before"] == pytest.approx(folder.manifest["heldout"][name], rel=1e-12)
     heldout = load_clips(sorted((run_dir / "data" / "heldout").glob("shard_*")), config.model.stride)
-    load_weights(folder.network, (run_dir / evaluated_uri(4, config)).read_bytes())
+    load_weights(folder.network, (run_dir / VIDEO_FILES.uri(4)).read_bytes())
     found = {name: values.mean() for name, values in context_scores(folder, heldout, probe, config).items()}
     last = read_metrics(run_dir, "heldout")[-1]
     for name, row in summary["scores"].items():
         assert row["after"] == pytest.approx(float(found[name]), rel=1e-12)
         assert last[name] == pytest.approx(float(found[name]), rel=1e-12)
-    assert (summary["weights"], summary["version"], summary["evaluations"]) == ("averaged", 4, 2)
+    assert (summary["version"], summary["evaluations"]) == (4, 2)
 
 
 @pytest.mark.slow
 def test_every_metric_is_in_the_document_and_tensorboard_has_them_too(run_dir: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    scores = {*ClipScores.__dataclass_fields__, *PICTURE_SCORES}
+    scores = {*ClipScores.__dataclass_fields__, *PICTURE_SCORES, *EXECUTION_SCORES}
     assert [line["step"] for line in read_metrics(run_dir, "grpo")] == [1, 2]
     assert [line["step"] for line in read_metrics(run_dir, "heldout")] == [1, 2]
     for line in read_metrics(run_dir):
@@ -148,8 +149,8 @@ def test_every_metric_is_in_the_document_and_tensorboard_has_them_too(run_dir: P
 def test_the_report_holds_table_pictures_command_and_settings(run_dir: Path) -> None:
     text = (run_dir / "report.html").read_text()
     assert text.count("data:image/png;base64") == 4
-    for part in ("object error, cm", "averaged weights", "Not watched: 2 held-out evaluations", "wm.py retrain",
-                 "ema_decay: 0.5", "rescore"):
+    for part in ("object error, cm", "Not watched: 2 held-out evaluations", "wm.py retrain", "closeness: 0.5",
+                 "rescore"):
         assert part in text
 
 
@@ -175,19 +176,24 @@ def test_recorded_clips_are_scored_again_to_the_same_bits(
     found = json.loads((run_dir / "rescored.json").read_text())
     assert found["equal"] and [row["iteration"] for row in found["buffers"]] == [0, 1]
     assert all(row["recorded"] == row["again"] for row in found["buffers"])
-    first, codec = recorded(run_dir)[0], load_video_folder(run_dir / "video_model").codec
-    assert first.weights["closeness"] == 0.5 and first.scores["closeness"].isfinite().all()
+    first, folder = recorded(run_dir)[0], load_video_folder(run_dir / "video_model")
+    for name in ("closeness", "execution"):
+        assert first.weights[name] == 0.5 and first.scores[name].isfinite().all() and first.scores[name].std() > 0
+    again = partial(
+        rescore, contexts=contexts, probe=probe, codec=folder.codec, rewards=config.rewards, num_conditioning=1,
+        execution=load_execution_reward(config, folder, contexts, probe),
+    )
     values = first.scores["tool_cm"].clone()
     values[3] = torch.nextafter(values[3], torch.tensor(torch.inf, dtype=torch.float64))
     changed = replace(first, scores={**first.scores, "tool_cm": values})
-    assert rescore(changed, contexts, probe, codec, config.rewards, 1).different == ("tool_cm",)
+    assert again(changed).different == ("tool_cm",)
     assert first.picture is not None
     dark = replace(first, picture=first.picture // 2)
-    assert {"psnr_db", "total"} <= set(rescore(dark, contexts, probe, codec, config.rewards, 1).different)
+    assert {"psnr_db", "execution", "total"} <= set(again(dark).different)
     with pytest.raises(BagError, match="picture of iteration 0 is not in the bag"):
-        rescore(replace(first, picture=None), contexts, probe, codec, config.rewards, 1)
+        again(replace(first, picture=None))
     with pytest.raises(BagError, match="beauty cannot be scored again"):
-        rescore(replace(first, scores={"beauty": values}), contexts, probe, codec, config.rewards, 1)
+        again(replace(first, scores={"beauty": values}))
 
 
 @pytest.mark.slow
@@ -211,12 +217,9 @@ def test_training_again_from_the_recording_gives_the_same_weights_and_other_rewa
     shutil.copytree(run_dir, tmp_path / "copy")
     assert main(["retrain", str(tmp_path / "copy"), "--run-dir", str(tmp_path / "same")]) == 2
     assert f"run is '{run_dir}' in this run, '{tmp_path / 'copy'}' is given" in capsys.readouterr().err
-    for name in ("video_000002.safetensors", "video_000004.safetensors", "averaged_000004.safetensors"):
+    for name in ("video_000002.safetensors", "video_000004.safetensors"):
         assert (tmp_path / "same" / "video_policies" / name).read_bytes() == live[name]
-    for mine, theirs in zip(read_metrics(tmp_path / "same"), read_metrics(run_dir), strict=True):
-        assert {k: v for k, v in mine.items() if "seconds" not in k} == {
-            k: v for k, v in theirs.items() if "seconds" not in k
-        }
+    assert read_metrics(tmp_path / "same") == read_metrics(run_dir)
     scores = {name: row["after"] for name, row in read_summary(run_dir)["scores"].items()}
     assert {name: row["after"] for name, row in read_summary(tmp_path / "same")["scores"].items()} == scores
     other = ["--run-dir", str(tmp_path / "other"), "--rewards.object_cm", "-0.1", "--no-tensorboard"]
@@ -354,7 +357,7 @@ def test_settings_that_the_graphs_model_or_the_ratio_cannot_have_are_refused_bef
 ) -> None:
     for setting, said in (
         ("grpo.kl.anchor=lora_off", "the graph's video model has none: take frozen"),
-        ("grpo.objective=nft", "objective nft has no transitions, got kl.mode mean with kl.anchor dual"),
+        ("grpo.objective=nft", "objective nft has no transitions, got kl.beta 0.5 with kl.anchor dual"),
     ):
         run_dir = tmp_path / "run"
         assert main(["train-video-model", f"--{setting}", "--run-dir", str(run_dir)]) == 2

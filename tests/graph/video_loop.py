@@ -41,8 +41,8 @@ def settings(**overrides: Any) -> VideoRlConfig:
     """Two groups of three clips, sampled one by one in more steps than are trained on, so that sampling can be met."""
     values = {
         "groups.contexts": 2, "groups.group_size": 3, "rollout.num_steps": 16, "rollout.micro_batch": 1,
-        "window.strategy": "random", "window.size": 3, "grpo.learning_rate": 1e-3, "evaluation.every": 0,
-        "rewards": {"tracking": 1.0, "psnr_db": 0.1},
+        "window.strategy": "progressive", "window.size": 3, "window.period": 1, "grpo.learning_rate": 1e-3,
+        "evaluation.every": 0, "rewards": {"tracking": 1.0, "psnr_db": 0.1},
     }
     return load_video_config("smoke", {**values, **overrides})
 
@@ -75,15 +75,11 @@ def make_video_folder(folder: Path, clips: Clips, config: VideoRlConfig | None =
 
 
 class LocalLoop:
-    """The training of the graph by video_rl/train.py, in this process, as far as it is asked for.
+    """The training of the graph by video_rl/train.py, in this process, as far as it is asked for."""
 
-    Args:
-        lag: buffer i is sampled by the weights that buffer i - lag was trained on.
-    """
-
-    def __init__(self, config: VideoRlConfig, folder: Path, bag: Path, lag: int = 0) -> None:
+    def __init__(self, config: VideoRlConfig, folder: Path, bag: Path) -> None:
         torch.set_num_threads(1)
-        self.config, self._lag = config, lag
+        self.config = config
         self._source = RecordedContexts(
             load_video_folder(folder), load_clips([bag], STRIDE), config, load_probe(MODEL_DIR)
         )
@@ -113,12 +109,11 @@ class LocalLoop:
         request = source.request(iteration, self.versions[after])
         return source.score(request, source.sample(request))
 
-    # What video_rl.train.ClipSource is: the weights of so many iterations ago sample.
+    # What video_rl.train.ClipSource is, with a network of its own.
 
     def request(self, iteration: int, policy_version: int) -> GroupRequest:
-        after = max(0, iteration - self._lag)
-        load_weights(self._source.folder.network, self.weights(after))
-        return self._source.request(iteration, self.versions[after])
+        load_weights(self._source.folder.network, self.weights(iteration))
+        return self._source.request(iteration, policy_version)
 
     def sample(self, request: GroupRequest) -> RolloutBuffer:
         return self._source.sample(request)
@@ -133,12 +128,12 @@ class LocalLoop:
 class VideoLoop:
     """The nodes of loop 2 on a graph, over files in `graph.folder`."""
 
-    def __init__(self, graph: Graph, probe: Probe, config: VideoRlConfig, lag: int = 0) -> None:
+    def __init__(self, graph: Graph, probe: Probe, config: VideoRlConfig) -> None:
         self.graph, self.probe, self.config = graph, probe, config
         self.bag = write_contexts(graph.folder / "contexts")
         self.model = make_video_folder(graph.folder / "video_model", load_clips([self.bag], STRIDE), config)
         (graph.folder / "video_config.yaml").write_text(dump_config(config), encoding="utf-8")
-        self.local = LocalLoop(config, self.model, self.bag, lag)
+        self.local = LocalLoop(config, self.model, self.bag)
         self.links = probe.links()
 
     def start(self, node: str, **params: Any) -> None:

@@ -31,6 +31,7 @@ EXPERIMENTS = {
     "clip-learning": "video_rl.recorded:ClipLearning", "resolution": "video_rl.recorded:Resolution",
     "outcome": "video_rl.outcome:Outcome", "closed-loop": "video_rl.closed_loop:ClosedLoop",
     "erring": "judge.erring:Erring", "success-clips": "judge.success_clips:SuccessClips",
+    "tables": "tables.command:Tables",
 }
 """Module of this package and class, by name; what each is about stands in wm_nodes.apps.cli."""
 LOG_COLUMNS = 180

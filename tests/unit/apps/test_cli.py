@@ -13,18 +13,21 @@ import pytest
 from benchmarks.experiment import EXPERIMENTS
 from wm_nodes.apps import cli
 from wm_nodes.core.errors import ModelNotAcceptedError, RunError
+from wm_nodes.reports.live_page import LivePage
 
 OPTIONS = {
     "train-model": "--bags --task --out --run-dir --preset --SECTION.KEY --device --seed",
     "train-policy": "--preset --SECTION.KEY --device --task --seed --run-dir --model-dir --from-scratch --force "
     "--environment --video-model --reward --judge --judge-model --judge-key-env --rubric --compose "
-    "--domain-id --verbose",
+    "--view --domain-id --verbose",
     "train-video-model": "--preset --SECTION.KEY --seed --run-dir --from-scratch --bags --heldout-bags --keep-buffers "
-    "--reward --judge --judge-model --judge-key-env --rubric --tensorboard --no-tensorboard --domain-id --verbose",
+    "--reward --judge --judge-model --judge-key-env --rubric --tensorboard --no-tensorboard --view --domain-id "
+    "--verbose",
     "check-video-model": "--video-model --context-bags --public --prompt --picture --size --lora-rank --preset "
     "--SECTION.KEY",
     "seed-study": "--tasks --seeds --arms --preset --SECTION.KEY --device --model-dir --threads --out",
     "collect": "folder --tasks --episodes --first-seed --preset --SECTION.KEY --device",
+    "view": "BAG|RUN_FOLDER --rate --loop --port",
     "rescore": "recording --reward --judge --judge-model --judge-key-env --rubric --json --config --model-dir "
     "--namespace --reads --audit",
     "retrain": "run --run-dir --SECTION.KEY --tensorboard",
@@ -38,7 +41,7 @@ OPTIONS = {
     "judge hack": "clips --config --device --judge --judge-model --judge-key-env --rubric --least --limit "
     "--limit-clips --seed --reads --json --pictures",
     "audit": "verify recover sample view agree people replay",
-    **{f"benchmark {name}": "--json" for name in EXPERIMENTS},
+    **{f"benchmark {name}": "--json" for name in EXPERIMENTS}, "benchmark tables": "--check --docs",
 }
 
 
@@ -94,6 +97,18 @@ def test_an_error_is_one_line_and_code_2(words: list[str], said: str, capsys: py
     assert cli.main(words) == 2
     text = capsys.readouterr().err
     assert text.startswith("error: ") and text.count("\n") == 1 and said in text
+
+
+def test_a_page_that_cannot_be_opened_is_one_line_before_anything_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with LivePage() as other:
+        for verb in ("train-policy", "train-video-model"):
+            assert cli.main([verb, "--preset", "smoke", "--view", str(other.port)]) == 2
+            text = capsys.readouterr().err
+            assert text.startswith(f"error: port {other.port} of this host cannot be used") and text.count("\n") == 1
+    assert not [*tmp_path.iterdir()]
 
 
 def test_a_wrong_option_is_one_line_and_code_2(capsys: pytest.CaptureFixture[str]) -> None:

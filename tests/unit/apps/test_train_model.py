@@ -39,6 +39,7 @@ def test_a_model_is_trained_judged_and_kept_and_the_folder_alone_goes_on(
     verdict = json.loads((model / "acceptance.json").read_text())
     assert code == (3 if verdict["failed"] else 0), err
     assert "used: 16 episodes" in text and "lost: nothing" in text and "Positions were not judged" in text
+    assert "What the tokenizer loses was not judged: fewer than 24 episodes are held out" in text
     assert f"acceptance {verdict['outcome']}" in text and "--model-dir" in text
     names = [row["name"].split(", step")[0] for row in verdict["criteria"]]
     assert names == [

@@ -12,7 +12,8 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.seed_ranges import HELDOUT
 from wm_nodes.environments.record import collect_plan, scripted_plan
 
-ARMS = ["CPS 0.4", "signed FM, ODE", "CPS 0.4, judge robot"]
+ARMS = ["CPS 0.4", "signed FM, ODE", "CPS 0.4, judge robot", "CPS 0.4, execution and outcome"]
+DONE = {f"{name}{after}" for name in ("accepted", "execution_success") for after in ("", "_executed")}
 
 
 def rows_of(path: Path) -> list[dict[str, Any]]:
@@ -36,15 +37,17 @@ def test_the_command_trains_measures_the_kept_weights_and_goes_on_where_its_file
     assert [row["sampler"] for row in first] == ARMS
     for row in first:
         assert len(row["evaluations"]) == 2
-        assert set(row["measured_before"]) == set(row["measured_after"]) == {*METRICS, "accepted", "accepted_executed"}
+        assert set(row["measured_before"]) == set(row["measured_after"]) == {*METRICS, *DONE}
         assert row["measured_before"] == first[0]["measured_before"], "all arms begin with the same model"
     assert first[0]["plan"]["rewards"] == [["outcome", 1.0]] and first[2]["plan"]["rewards"] == [["agent", 1.0]]
+    assert first[3]["plan"]["rewards"] == [["execution", 1.0], ["outcome", 0.3]]
     assert {file.name for file in kept.iterdir()} == {
-        "CPS_0.4_0.safetensors", "signed_FM_ODE_0.safetensors", "CPS_0.4_judge_robot_0.safetensors"
+        "CPS_0.4_0.safetensors", "signed_FM_ODE_0.safetensors", "CPS_0.4_judge_robot_0.safetensors",
+        "CPS_0.4_execution_and_outcome_0.safetensors",
     }
-    assert len({file.read_bytes() for file in kept.iterdir()}) == 3, "two arms are the same training"
+    assert len({file.read_bytes() for file in kept.iterdir()}) == 4, "two arms are the same training"
     assert (tmp_path / "found_proxy.png").is_file()
     assert "executed_success" in METRICS and "metrics that nothing trained on" in capsys.readouterr().out
     assert main([*call[:-len(ARMS)], ARMS[0], "--seeds", "0", "1"]) == 0
     rows = rows_of(path)
-    assert rows[:3] == first and [(row["sampler"], row["seed"]) for row in rows[3:]] == [(ARMS[0], 1)]
+    assert rows[:4] == first and [(row["sampler"], row["seed"]) for row in rows[4:]] == [(ARMS[0], 1)]

@@ -1,5 +1,7 @@
 """An environment of Gymnasium by settings: its actions, pictures, state, success and limit, and what is refused."""
 
+from collections.abc import Iterator
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium
@@ -8,6 +10,7 @@ import pytest
 from drawn_pendulum import SETTINGS
 from gymnasium import spaces
 
+from examples import fetch_controller
 from wm_nodes.config.load import ConfigError, load_config
 from wm_nodes.core.types import Environment
 from wm_nodes.environments.registry import configured_spec, make_environment
@@ -41,8 +44,11 @@ SEESAW = {
 }
 
 
-def made(settings: dict[str, Any], num_envs: int = 2) -> Environment:
-    config = load_config("smoke", settings)
+VIEW = {"top": {"lookat_m": [0, 0, 0], "distance_m": 1, "azimuth_deg": 0, "elevation_deg": -90}}
+
+
+def made(settings: dict[str, Any], num_envs: int = 2, preset: str = "smoke") -> Environment:
+    config = load_config(preset, settings)
     return make_environment(config, config.environment.factory, num_envs=num_envs, seed=0)
 
 
@@ -77,6 +83,44 @@ def test_a_seed_decides_an_episode_in_whichever_copy() -> None:
     assert (environment.reset().state[0] != shown.state[0]).any()
 
 
+def test_an_action_of_1_takes_a_share_of_its_range_and_single_values_are_a_state() -> None:
+    settings = {**SEESAW, "gymnasium.action_scale": 0.5, "gymnasium.state": ["goal.1", "angle"]}
+    spec = configured_spec(load_config("smoke", settings))
+    assert (spec.action_scale, spec.state_names) == ((1.0, 1.0), ("goal.1", "angle.0"))
+    environment = made(settings)
+    environment.reset()
+    result = environment.step(np.array([[1, 0], [-1, 0]], np.float32))
+    np.testing.assert_allclose(result.observation.state, [[-0.5, 0.75], [-0.5, 0.25]])
+
+
+@pytest.fixture
+def fetch_reach() -> Iterator[Environment]:
+    if find_spec("gymnasium_robotics") is None:  # not imported here: MuJoCo chooses how to draw when it is imported
+        pytest.skip("FetchReach needs requirements/gym.txt")
+    environment = made({}, preset="fetch_reach")
+    yield environment
+    environment.close()
+
+
+def test_fetch_reach_shows_its_goal_in_both_cameras_and_says_success(fetch_reach: Environment) -> None:
+    policy = fetch_controller.reach(load_config("fetch_reach"))
+    shown = fetch_reach.reset(seeds=np.array([3, 4], np.uint64))
+    assert shown.image.shape == (2, 64, 128, 3) and shown.state.shape == (2, 3)
+    red = (shown.image[..., 0] > 90) & (shown.image[..., 1:] < 60).all(-1)
+    assert (red.reshape(2, 64, 2, 64).sum((1, 3)) > 3).all()
+    success = np.zeros(2, bool)
+    for _ in range(fetch_reach.spec.max_episode_steps):
+        result = fetch_reach.step(policy.act(shown.image, shown.state).actions)
+        shown, success = result.observation, success | result.terminated
+    assert success.all() and not result.valid.any()
+
+
+def test_an_action_of_1_moves_fetch_by_about_a_centimetre(fetch_reach: Environment) -> None:
+    before = fetch_reach.reset().state
+    moved = [fetch_reach.step(np.tile(np.float32([1, 0, 0, 0]), (2, 1))).observation.state for _ in range(4)][-1]
+    assert 0.03 < (moved - before)[:, 0].mean() < 0.06
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -85,6 +129,10 @@ def test_a_seed_decides_an_episode_in_whichever_copy() -> None:
         ({"gymnasium.kwargs": {}}, "sets no limit to an episode; give gymnasium.kwargs max_episode_steps"),
         ({"gymnasium.state": ["speed"]}, r"no 'speed'; .* may name \['angle', 'camera', 'goal'\]"),
         ({"gymnasium.pixels": "angle"}, r"pixels 'angle' gives float32 \(1,\), not uint8 \(H, W, 3\)"),
+        ({"gymnasium.state": ["goal.2"]}, r"gymnasium.state names goal.2, and goal has 2 values"),
+        ({"gymnasium.pixels": "cameras"}, "pixels is cameras, and cameras names none"),
+        ({"gymnasium.pixels": "cameras", "gymnasium.cameras": VIEW}, "needs an environment of MuJoCo, not Seesaw"),
+        ({"gymnasium.action_scale": 2.0}, "gymnasium.action_scale: .* less than or equal to 1"),
         ({"environment.factory": "mujoco"}, "no environment 'mujoco'; choose one of maniskill, gymnasium"),
     ],
 )

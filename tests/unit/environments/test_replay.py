@@ -50,17 +50,6 @@ def test_a_recorded_path_does_again_what_it_did_and_one_that_stays_does_nothing(
     assert still.object_error_cm[0] == pytest.approx(pushed_cm, abs=0.1)
 
 
-@pytest.mark.slow
-def test_several_processes_give_the_same_bits(recorded: list[Episode]) -> None:
-    paths = np.stack([episode.ground_truth[::STRIDE, TOOL] for episode in recorded])
-    one, two = (
-        execute_paths("push_cube", SIMULATION, [11, 3], paths, np.zeros((2, 2)), STRIDE, num_workers=workers)
-        for workers in (1, 2)
-    )
-    for name, values in vars(one).items():
-        np.testing.assert_array_equal(values, getattr(two, name))
-
-
 def test_a_jump_is_not_followed(recorded: list[Episode]) -> None:
     path = recorded[1].ground_truth[None, ::STRIDE, TOOL].copy()
     path[0, 4:, 1] += 0.3

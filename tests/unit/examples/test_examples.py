@@ -3,14 +3,20 @@
 import importlib
 import re
 import shlex
+import warnings
 from pathlib import Path
 
+import gymnasium
+import numpy as np
 import pytest
 
 import examples
 from wm_nodes.config.tasks import VARIABLE, get_task, task_names
+from wm_nodes.policy_rl.gym import ID
 
 NAMES = ("own_environment", "own_learner", "own_policy", "own_reward", "own_task")
+IN_GYMNASIUM = ("imagined_ppo", "imagined_sb3")
+NO_SB3 = "Stable-Baselines3 is in requirements/gym.txt"
 FOLDER = Path(str(examples.__file__)).parent
 
 
@@ -34,6 +40,39 @@ def test_an_example_is_trained_with_by_its_command(
     run_command(name, monkeypatch, tmp_path)
     kind = "real" if name == "own_environment" else "imagined"
     assert len(re.findall(rf"version \d+: {kind} success \d", capsys.readouterr().out)) == 3
+
+
+@pytest.mark.parametrize("name", IN_GYMNASIUM)
+def test_a_foreign_algorithm_trains_in_the_world_model_by_its_command(
+    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if name == "imagined_sb3":
+        pytest.importorskip("stable_baselines3", reason=NO_SB3)
+    run_command(name, monkeypatch, tmp_path)
+    assert len(re.findall(r"update \d+: imagined success \d", capsys.readouterr().out)) == 3
+
+
+def test_stable_baselines_hears_how_an_episode_ended_and_has_its_last_observation() -> None:
+    pytest.importorskip("stable_baselines3", reason=NO_SB3)
+    from examples.imagined_sb3 import ImaginedVecEnv
+
+    short = {"simulation.max_episode_steps": 2}
+    envs = ImaginedVecEnv(gymnasium.make_vec(ID, 2, task="push_cube", settings=short))
+    begun, still = envs.reset(), np.zeros((2, 3), np.float32)
+    _, _, dones, infos = envs.step(still)
+    assert not dones.any() and infos == [{}, {}]
+    shown, _, dones, infos = envs.step(still)
+    assert dones.all() and [info["TimeLimit.truncated"] for info in infos] == [True, True]
+    for i, info in enumerate(infos):
+        assert not info["is_success"] and (info["terminal_observation"]["image"] != shown["image"][i]).any()
+        np.testing.assert_allclose(info["terminal_observation"]["state"], begun["state"][i], atol=1e-6)
+
+
+def test_stable_baselines_finds_nothing_wrong_with_a_single_one() -> None:
+    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason=NO_SB3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        checker.check_env(gymnasium.make(ID, task="push_cube"))
 
 
 @pytest.mark.rendering

@@ -25,6 +25,7 @@ from wm_nodes.launching.scenarios import (
     describe_arguments,
     parse_arguments,
 )
+from wm_nodes.reports.live_page import LivePage, free_port
 from wm_nodes.ros.middleware import PROFILE
 from wm_nodes.training.run_lock import RunFolderInUseError
 from wm_nodes.training.run_record import read_record
@@ -32,8 +33,9 @@ from wm_nodes.world_model import load_starts
 
 FILES: list[tuple[str, dict[str, str]]] = [
     *((scenario, {}) for scenario in SCENARIOS), ("online_training", {"compose": "true", "respawn": "true"}),
+    ("online_training", {"view": "page"}),
 ]
-"""Every launch file as it starts by default, and the one whose nodes may share a process."""
+"""Every launch file as it starts by default, the one whose nodes may share a process, and one that is looked at."""
 
 
 @pytest.fixture
@@ -71,6 +73,8 @@ def test_each_scenario_has_the_nodes_that_its_summary_promises(given: dict[str, 
     assert labels("evaluate", given) == [*simulator, "wm/recorder"]
     assert labels("world_model_rl", given) == ["wm/video_model", "wm/reward_evaluator", "wm/learner", "wm/recorder"]
     assert labels("online_training", given, compose="true") == ["wm/composed", "wm/sim/environment"]
+    for scenario in SCENARIOS:
+        assert labels(scenario, given, view="page")[-1] == "wm/viewer"
     assert labels("evaluate", given, namespace="/lab/two", compose="false")[0] == "lab/two/sim/environment"
 
 
@@ -90,16 +94,11 @@ def test_every_node_module_and_its_ros2_run_name_exist(
     "scenario", ["online_training", "rollout_record", "replay_offline", "evaluate", "world_model_rl"]
 )
 def test_nodes_get_only_parameters_that_they_declare(scenario: str, given: dict[str, str]) -> None:
-    """Nodes refuse unknown parameters; the declared names are read from the node's source."""
-    graph, _ = launch_arguments.prepare(scenario, of(scenario, given))
+    """Nodes refuse unknown parameters."""
+    graph, _ = launch_arguments.prepare(scenario, of(scenario, given) | {"view": "page"})
     common = {"config_file", "run_dir", "allowed_dirs", "autostart", "executor", "memory_limit_gib", "use_sim_time"}
     for node in graph.nodes:
-        spec = importlib.util.find_spec(node.module)
-        assert spec is not None and spec.origin is not None
-        calls = [n for n in ast.walk(ast.parse(Path(spec.origin).read_text())) if isinstance(n, ast.Call)]
-        declared = {
-            ast.literal_eval(call.args[0]) for call in calls if getattr(call.func, "id", "") == "Param" and call.args
-        }
+        declared = {param.name for param in importlib.import_module(node.module).PARAMS}
         assert set(node.parameters) - common <= declared, node.label
 
 
@@ -182,6 +181,20 @@ def test_learner_of_several_ranks_is_not_composed(given: dict[str, str]) -> None
 def test_bad_arguments_are_named(wrong: dict[str, str], message: str, given: dict[str, str]) -> None:
     with pytest.raises(GraphError, match=message):
         launch_arguments.prepare("rollout_record", of("rollout_record", given) | wrong)
+
+
+def test_the_page_gets_a_free_port_shows_environment_0_and_is_not_required(given: dict[str, str]) -> None:
+    asked = of("online_training", given) | {"view": "page"}
+    graph, values = launch_arguments.prepare("online_training", asked)
+    viewer = graph.node("viewer")
+    assert not viewer.required and not viewer.lifecycle and all(node.required for node in graph.nodes[:-1])
+    assert viewer.parameters["port"] == int(values["view_port"]) > 0
+    assert [node.parameters["view_env"] for node in graph.nodes if node.name == "environment"] == [0, 0]
+    assert Graph.from_json(graph.to_json()) == graph
+    record = read_record(Path(values["run_dir"]))
+    assert record is not None and not {"view", "view_port"} & set(record.options["online_training"])
+    with LivePage() as other, pytest.raises(ValueError, match=f"port {other.port} of this host cannot be used"):
+        launch_arguments.prepare("online_training", asked | {"view_port": str(other.port)})
 
 
 def test_unknown_scenario_and_two_nodes_of_one_name_are_refused() -> None:
@@ -268,7 +281,7 @@ def test_both_faces_of_a_launch_file_start_the_same_processes(
     scenario: str, compose: dict[str, str], given: dict[str, str], repository: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     setting = {} if "judge" in SCENARIOS[scenario].arguments else {"judge.max_reads": "3"}
-    values = of(scenario, given) | compose | setting
+    values = of(scenario, given) | compose | setting | ({"view_port": free_port("0")} if "view" in compose else {})
     stub = StubLaunch(values)
     for name, module in stub.modules().items():
         monkeypatch.setitem(sys.modules, name, module)
@@ -306,7 +319,7 @@ def test_both_faces_of_a_launch_file_start_the_same_processes(
         else:
             assert action.named["name"] == node.name
             assert action.named["parameters"] == ([dict(node.parameters)] if node.parameters else [])
-        assert ("on_exit" in action.named) == (not node.respawn)
+        assert ("on_exit" in action.named) == (node.required and not node.respawn)
         assert action.named.get("respawn", False) == node.respawn == (values.get("respawn") == "true")
         assert action.named["additional_env"]["ROS_DOMAIN_ID"] == str(runner.domain) == "7"
 

@@ -103,7 +103,7 @@ def test_a_recording_whose_clock_was_set_back_is_played_in_the_order_it_was_made
     assert played(Playback(tmp_path / "bag", rate=1e6, start_offset_s=1.0))[0] == published
 
 
-LATCHED, KEPT, VOLATILE = topics.LATCHED, topics.VERSIONS, topics.METRICS
+LATCHED, KEPT, VOLATILE = topics.LATCHED, topics.LATCHED._replace(depth=2), topics.METRICS
 
 
 def latched_bag(path: Path) -> Path:

@@ -71,7 +71,7 @@ SUMMARY = Summary(
 
 SAME = ScoreChange(0.5, 0.5, 0.0, -0.1, 0.1, "")
 CLIPS = ClipSummary(
-    "push_cube", "smoke", 3, iterations=6, version=12, weights="averaged", contexts=48, evaluations=3,
+    "push_cube", "smoke", 3, iterations=6, version=12, contexts=48, evaluations=3,
     watched=("success", "outcome"),
     scores=dict.fromkeys(TITLES, SAME) | {"tracking": ScoreChange(0.5, 0.6, 0.1, 0.05, 0.15, "better")},
     hacked=[{"step": 6, "reward_slope": 0.1, "slopes": {"scenery": -0.2}, "text": "scenery gets <worse>"}],
@@ -334,7 +334,7 @@ def test_the_report_of_loop_2_shows_scores_alarms_and_how_to_do_it_again(tmp_pat
     page.feed(text)
     assert not page.open and len(page.sources) == 1
     for part in ("Better: tracking score (n = 48 held-out contexts).", "+0.1000 (+0.0500 to +0.1500)",
-                 "averaged weights", "scenery gets &lt;worse&gt;", f"retrain {tmp_path}", "P &amp; Q"):
+                 "scenery gets &lt;worse&gt;", f"retrain {tmp_path}", "P &amp; Q"):
         assert part in text
     write_summary(tmp_path, CLIPS)
     values = read_summary(tmp_path)

@@ -8,7 +8,7 @@ import torch
 from wm_nodes.policy_rl.training_run import POLICY_FILES
 from wm_nodes.training.run_folder import TrainingRun, VersionFiles
 from wm_nodes.training.weights import PackedWeights, save_weights
-from wm_nodes.video_rl.training_run import AVERAGED_FILES, VIDEO_FILES
+from wm_nodes.video_rl.training_run import VIDEO_FILES
 
 
 class CountingRun(TrainingRun):
@@ -45,7 +45,6 @@ class CountingRun(TrainingRun):
 def test_files_of_both_loops_keep_their_names() -> None:
     assert POLICY_FILES.uri(3) == "policies/policy_000003.safetensors"
     assert VIDEO_FILES.uri(12) == "video_policies/video_000012.safetensors"
-    assert AVERAGED_FILES.uri(12) == "video_policies/averaged_000012.safetensors"
 
 
 def test_the_newest_versions_are_kept_and_read_back_as_they_were_written(tmp_path: Path) -> None:

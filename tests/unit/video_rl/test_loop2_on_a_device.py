@@ -6,6 +6,7 @@ A forgotten move between the CPU and the device, in any of these paths, is refus
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,14 @@ from torch.testing import assert_close
 from video_toys import ACTION_DIM, tiny_network, toy_buffer, toy_rollout_settings
 
 from benchmarks.video_rl.cost import toy_rollout
+from benchmarks.video_rl.discs import training_batch
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_video_config
+from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import DeviceError, device_of
 from wm_nodes.core.seeding import torch_stream
+from wm_nodes.core.specs import spec_of_values
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.judge.service import buffer_jobs
 from wm_nodes.nodes.video_model_node import film_strip
@@ -34,13 +38,15 @@ from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.flow_matching import train_video_model
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_model.tokenizer_codec import codec_of_world_model
+from wm_nodes.video_rl.execution_reward import load_execution_reward
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.pretraining import make_video_model
-from wm_nodes.video_rl.sampling import RecordedContexts
-from wm_nodes.video_rl.toy_scene import NETWORK, ToyContexts, draw_scenes, load_base, training_batch
+from wm_nodes.video_rl.sampling import RecordedContexts, sample_by_ode
+from wm_nodes.video_rl.toy_scene import NETWORK, ToyContexts, draw_scenes, load_base
 from wm_nodes.video_rl.train import post_train, sample_buffers
 from wm_nodes.video_rl.training_run import VideoRun, progress
 from wm_nodes.video_rl.validation import context_scores
+from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.position_probe import PositionProbe
 
 TOY = {
@@ -54,8 +60,7 @@ SMALL = {
 }
 """The preset gpu at a size for tests."""
 NFT = {
-    "grpo.objective": "nft", "grpo.kl.mode": "velocity", "grpo.kl.anchor": "frozen", "grpo.nft.old_decay": 0.5,
-    "grpo.nft.old_ramp": 1.0,
+    "grpo.objective": "nft", "grpo.kl.anchor": "frozen", "grpo.nft.old_decay": 0.5, "grpo.nft.old_ramp": 1.0,
 }
 Found = dict[str, Tensor]
 
@@ -105,12 +110,12 @@ def test_flow_matching_learns_the_same_weights_and_goes_on_from_a_checkpoint(dev
 @pytest.mark.parametrize(
     "changes",
     [
-        {"grpo.kl.anchor": "dual", "grpo.kl.dual_every": 1, "grpo.ema_decay": 0.9},
+        {"grpo.kl.anchor": "dual", "grpo.kl.dual_every": 1},
         {"rollout.buffer_device": "cpu", "grpo.kl.anchor": "frozen", "rollout.storage_dtype": "bfloat16"},
-        {"rollout.sampler.arm": "flow", "rollout.cfg": 2.0, "grpo.cfg": 2.0},
-        {"rollout.noise_store": "zeta_bfloat16", "rollout.sampler.arm": "sage", "rollout.buffer_device": "cpu"},
+        {"rollout.sampler.arm": "flow", "rollout.cfg": 2.0},
+        {"rollout.sampler.arm": "sage", "rollout.buffer_device": "cpu"},
         {**NFT, "rollout.sampler.arm": "ode"},
-        {**NFT, "rollout.buffer_device": "cpu", "grpo.kl.mode": "none"},
+        {**NFT, "rollout.buffer_device": "cpu", "grpo.kl.beta": 0.0},
     ],
     ids=["dual", "host", "flow", "sage", "nft", "nft, host"],
 )
@@ -133,10 +138,10 @@ def test_the_toy_is_sampled_scored_trained_saved_and_evaluated_alike(
                 found[f"buffer {iteration}"] = as_bytes(buffer.to_bytes())
             numbers = [value for update in report.updates for value in list(vars(update).values())[:7]]
             found[f"report {iteration}"] = torch.tensor([*numbers, report.reward_mean, report.noise_share])
-            learner.save(path, iteration=iteration + 1)
+            learner.save(path)
         again = learner_of(ToyContexts(load_base(device=where), config))
-        assert again.load(path) == 2
-        found |= {f"averaged {name}": value.cpu().clone() for name, value in again.averaged.items()}
+        again.load(path)
+        assert again.iterations == 2
         found |= {name: value.cpu() for name, value in source.evaluate(draw_scenes(3, 0, "evaluation")).named().items()}
         following = [source.score(request, source.sample(request)) for request in [source.request(2, learner.version)]]
         for one in (learner, again):
@@ -167,7 +172,6 @@ def test_a_failed_update_leaves_the_weights_as_they_were_and_copies_none_to_the_
 
 
 def test_an_optimizer_step_waits_for_the_device_only_to_report_and_to_see_that_it_is_finite(device: Device) -> None:
-    """The clocks wait too, four times for each call of the network."""
     if device.counts is None:
         pytest.skip("a real device does not count")
     settings = toy_rollout_settings()
@@ -177,9 +181,8 @@ def test_an_optimizer_step_waits_for_the_device_only_to_report_and_to_see_that_i
     device.counts.reset()
     (update,) = learner.train(buffer).updates
     calls, waits = -(-update.transitions // 4), device.counts.by_kind(WAITS)
-    assert waits.pop("synchronize") == 4 * calls > 20
     reports = 3  # the noise that the buffer spent, in all and by step, and what the optimizer step logs
-    assert waits.total() <= 1 + reports, device.counts.report()
+    assert calls > 5 and waits.total() <= 1 + reports, device.counts.report()
     assert device.counts.copies_up <= 10 * calls + 2, device.counts.report()
 
 
@@ -222,7 +225,7 @@ def test_the_preset_gpu_trains_a_video_model_and_post_trains_it_in_a_run_folder(
                 run.train(source.score(request, source.sample(request)))
             run.close()
         assert progress(run_dir) == (2, 2) and device_of(run.network).type == where
-        shown = source.evaluate(heldout, 3).cpu()
+        shown = sample_by_ode(model, heldout, config, 3).cpu()
         assert shown.float().std() > 1
         return found | weights_of(run.network) | {"shown": shown}
 
@@ -298,3 +301,20 @@ def test_too_little_memory_for_clips_or_for_an_update_names_what_to_lower_and_ch
     run.close()
     assert all(torch.equal(weights_of(source.network)[name], weight) for name, weight in before.items())
     assert (run.version, run.iterations) == (0, 0)
+
+
+def test_an_action_world_model_pays_clips_where_the_video_model_is(device: Device) -> None:
+    world = shipped_model("push_cube")
+    shown, recordings = clips(3, 0, 64, 128), clips(4, 1, 64, 128)
+    states = recordings.ground_truth[..., 4:7] + np.float32([0.6, 0, 0])
+    spec = spec_of_values(read_world_manifest(world)["spec"])
+    recordings = replace(recordings, states=states, spec=spec)
+
+    def work(where: str) -> Found:
+        config = small_config(where, rewards={"execution": 1.0})
+        folder = load_video_folder(world / "video_model_outcome", where)
+        reward = load_execution_reward(config, folder, recordings, probe_on(where, 64, 128))
+        assert reward is not None and device_of(folder.network).type == where
+        return reward.score(shown.frames.to(where), recordings.select(torch.arange(3)))
+
+    check_both(device, work)

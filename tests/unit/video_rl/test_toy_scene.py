@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.testing import assert_close
 from video_toys import randn
 
+from benchmarks.video_rl.discs import training_batch
 from wm_nodes.video_rl.toy_scene import (
     CHANNELS,
     COLOUR,
@@ -20,7 +21,6 @@ from wm_nodes.video_rl.toy_scene import (
     draw_scenes,
     opacity_at,
     score,
-    training_batch,
 )
 
 

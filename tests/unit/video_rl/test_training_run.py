@@ -16,7 +16,7 @@ from wm_nodes.training.metrics import read_metrics
 from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model import VideoNetwork
 from wm_nodes.video_rl.reference_reward import more_is_better
-from wm_nodes.video_rl.training_run import VIDEO_FILES, VideoRun, evaluated_uri, progress
+from wm_nodes.video_rl.training_run import VIDEO_FILES, VideoRun, progress
 from wm_nodes.video_rl.validation import WATCHED, alarm_text, alarms_of, find_hacked_now
 
 ROLLOUT = toy_rollout_settings(micro_batch=8)
@@ -145,45 +145,34 @@ def test_without_an_evaluation_setting_nothing_is_asked(tmp_path: Path, network:
     assert not heldout.seen and not read_metrics(tmp_path, "heldout")
 
 
-def test_averaged_weights_are_scored_and_lie_beside_each_version_that_is_kept(
-    tmp_path: Path, network: VideoNetwork
-) -> None:
-    settings, heldout = config(ema_decay=0.9), Falling(network)
-    run = VideoRun(network, settings, tmp_path, keep_versions=2, heldout=heldout)
+def test_old_versions_are_deleted_and_the_newest_one_is_scored(tmp_path: Path, network: VideoNetwork) -> None:
+    assert progress(tmp_path) == (0, 0), "no checkpoint is no progress"
+    heldout = Falling(network)
+    run = VideoRun(network, config(), tmp_path, keep_versions=2, heldout=heldout)
     train(run, [1, 2, 3])
     run.close()
     assert progress(tmp_path) == (6, 3)
     names = {path.name for path in (tmp_path / "video_policies").iterdir()}
-    assert names == {f"{kind}_00000{version}.safetensors" for kind in ("video", "averaged") for version in (4, 6)}
-    own, averaged = tiny_network(seed=1), tiny_network(seed=1)
+    assert names == {f"video_00000{version}.safetensors" for version in (4, 6)}
+    own = tiny_network(seed=1)
     load_weights(own, (tmp_path / VIDEO_FILES.uri(6)).read_bytes())
-    load_weights(averaged, (tmp_path / evaluated_uri(6, settings)).read_bytes())
-    for name, value in weights(averaged).items():
-        assert torch.equal(value, run.learner.averaged[name]) and torch.equal(value, heldout.seen[-1][name])
-    assert any(not torch.equal(value, weights(own)[name]) for name, value in weights(averaged).items())
-    assert all(torch.equal(value, weights(network)[name]) for name, value in weights(own).items())
+    for name, value in weights(own).items():
+        assert torch.equal(value, weights(network)[name]) and torch.equal(value, heldout.seen[-1][name])
 
 
-def test_without_an_average_the_version_itself_is_evaluated_and_no_checkpoint_is_no_progress(tmp_path: Path) -> None:
-    assert evaluated_uri(4, config()) == VIDEO_FILES.uri(4)
-    assert progress(tmp_path) == (0, 0)
-
-
-def test_a_skipped_buffer_is_counted_in_the_log_and_a_resumed_run_samples_by_the_same_version(tmp_path: Path) -> None:
-    """The next buffer was sampled while this one was to be trained on, by the version that is still the newest."""
+def test_a_skipped_buffer_is_counted_in_the_log_and_a_resumed_run_goes_on_alike(tmp_path: Path) -> None:
     straight, stopped = tmp_path / "straight", tmp_path / "stopped"
-    settings = config(every=0, max_staleness=8)
+    settings = config(every=0)
     for folder, restart in ((straight, False), (stopped, True)):
         run = VideoRun(tiny_network(), settings, folder)
         train(run, [1])
-        previous = run.previous_version
         equal = toy_buffer(run.network, ROLLOUT, version=run.version, iteration=run.iterations)
         report = run.train(equal.with_rewards({"total": torch.full((8,), 0.3)}))
-        assert not report.updates and (previous, run.version, run.iterations) == (0, 2, 2)
+        assert not report.updates and (run.version, run.iterations) == (2, 2)
         if restart:
             run.close()
             run = VideoRun(tiny_network(seed=4), settings, folder)
-        assert (run.sampling_version, run.version, run.iterations, run.learner.skipped) == (2, 2, 2, 1)
+        assert (run.version, run.iterations, run.learner.skipped) == (2, 2, 1)
         train(run, [2])
         run.close()
     assert [line["skipped"] for line in read_metrics(stopped, "grpo")] == [0, 1, 0]

@@ -201,6 +201,7 @@ BY_PICTURES = {
     "feature_episodes_h08": 20.0, "feature_episodes_h16": 9.0,
     "feature_ratio_h08": 0.5, "feature_ratio_low_h08": 0.4, "feature_ratio_high_h08": 0.6,
     "other_actions_h08": 1.3, "other_actions_low_h08": 1.1, "other_actions_high_h08": 1.5,
+    "varying_error_h00": 0.2, "varying_error_h01": 0.1, "varying_error_h16": 9.0,
 }
 
 
@@ -214,11 +215,12 @@ def test_a_model_without_positions_passes_by_its_done_signal_its_pictures_and_it
     assert report.passed and [(row.name, row.value) for row in report.criteria] == [
         ("done precision on rollouts", 0.9), ("done recall on rollouts", 0.8),
         ("feature distance / copying, step 8", 0.5), ("feature distance, other / recorded actions, step 8", 1.3),
+        ("varying pixels, unexplained, step 0", 0.2),
     ]
     notes = " ".join(report.notes)
     for words in ("Positions were not judged", "AUC of the done signal: 0.87, chance is 0.5",
                   "up to step 8, which half of the held-out episodes reach; imagined episodes have up to 16",
-                  "they do not see", "Agreement of imagined and real success was not judged"):
+                  "Agreement of imagined and real success was not judged"):
         assert words in notes
 
 
@@ -229,6 +231,7 @@ def test_a_model_without_positions_passes_by_its_done_signal_its_pictures_and_it
         ({"feature_ratio_h08": np.nan}, "failed", "feature distance / copying, step 8"),
         ({"other_actions_h08": 1.0, "other_actions_low_h08": 1.0, "other_actions_high_h08": 1.01}, "failed",
          "other / recorded actions, step 8"),
+        ({"varying_error_h04": 0.9}, "failed", "varying pixels, unexplained, step 4"),
         ({"other_actions_low_h08": 0.9}, "undecided", "other / recorded actions, step 8"),
         ({"done_stir_recall": 0.3, "done_stir_recall_high": 0.5}, "failed", "done recall on rollouts"),
         ({"done_stir_recall": 0.3, "done_stir_recall_high": 0.7}, "undecided", "done recall on rollouts"),
@@ -246,12 +249,14 @@ def test_without_positions_each_criterion_alone_keeps_a_model_back(
 
 def test_what_recordings_cannot_show_is_named_and_not_judged() -> None:
     report = judged_by_pictures(
-        done_stir_real_rate=1.0, done_stir_auc=np.nan, other_actions_low_h08=np.nan, other_actions_h08=np.nan
+        done_stir_real_rate=1.0, done_stir_auc=np.nan, other_actions_low_h08=np.nan, other_actions_h08=np.nan,
+        varying_error_h00=np.nan, varying_error_h01=np.nan,
     )
     assert [row.name for row in report.criteria] == ["done recall on rollouts", "feature distance / copying, step 8"]
     notes = " ".join(report.notes)
     for words in ("Precision of the done signal was not judged: every held-out episode succeeds",
-                  "AUC of the done signal was not judged", "Sensitivity to actions was not judged"):
+                  "AUC of the done signal was not judged", "Sensitivity to actions was not judged",
+                  "What the tokenizer loses was not judged"):
         assert words in notes
 
 
@@ -262,7 +267,7 @@ def test_a_truth_without_positions_is_judged_by_what_the_pictures_said_when_the_
         "heldout": {**BY_PICTURES, "episodes": 20.0}, "success_threshold": config.reward.success_threshold,
     }
     report = report_when_made(manifest, config)
-    assert report.passed and report.episodes == 20 and len(report.criteria) == 4
+    assert report.passed and report.episodes == 20 and len(report.criteria) == 5
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,8 @@ from benchmarks.video_rl.comparison import SamplerComparison
 from benchmarks.video_rl.controls import TRAINING_CALLS, FlowMatchingLearner, RecordedTargets
 from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers
-from benchmarks.video_rl.sources import TASK, config_of, reward_spread
+from benchmarks.video_rl.sources import TASK, config_of
+from benchmarks.video_rl.spread import reward_spread
 from benchmarks.video_rl.trainings import OnIteration, RecordedTrainings, row_name
 from benchmarks.video_rl.trials import SamplerTrial
 from wm_nodes.config.seed_ranges import seed_spans
@@ -32,7 +33,7 @@ from wm_nodes.video_model.success_reader import SUCCESS_MANIFEST, WEIGHTS
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.horizons import horizon_scores
 from wm_nodes.video_rl.reference_reward import load_probe, score_clips
-from wm_nodes.video_rl.sampling import RecordedContexts
+from wm_nodes.video_rl.sampling import RecordedContexts, sample_by_ode
 from wm_nodes.world_model.position_probe import PositionProbe
 
 PRESET, REWARDS = "closed_loop", {"tracking": 1.0}
@@ -105,7 +106,7 @@ class ClosedLoopSource(RecordedContexts):
     def validate(self) -> Mapping[str, list[float]]:
         """Scores of whole rollouts and of each of their clips. error_cm: of tool and object together. win: 1 where that
         is smaller than at the first call, 0.5 where it is the same."""
-        frames = self.evaluate(self._heldout, self.config.evaluation.num_steps)
+        frames = sample_by_ode(self.folder, self._heldout, self.config, self.config.evaluation.num_steps)
         found = score_clips(frames, self._heldout, self.probe, self.folder.clip["num_conditioning"])
         scores = {name: getattr(found, name) for name in SCORES}
         scores["error_cm"] = scores["object_cm"] + scores["tool_cm"]

@@ -15,9 +15,9 @@ from torch.nn.utils import clip_grad_norm_
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import GrpoConfig, RolloutConfig
 from wm_nodes.core.device import device_of
-from wm_nodes.video_model import RolloutBuffer, VideoNetwork, VideoRollout, config_hash, flow_times
+from wm_nodes.video_model import RolloutBuffer, VideoNetwork, VideoRollout, config_hash
 from wm_nodes.video_model.flow_matching import flow_matching_loss
-from wm_nodes.video_rl.grpo import BufferReport, UpdateReport, mixed_reward
+from wm_nodes.video_rl.grpo import BufferReport, UpdateReport
 from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
 
 TRAINING_CALLS = 3
@@ -30,7 +30,7 @@ class FlowMatchingLearner:
     """Trains `model` in place by flow matching on clips of a buffer; the interface is that of GrpoLearner.
 
     Args:
-        settings: learning_rate, weight_decay, max_grad_norm, updates_per_buffer, max_staleness are used.
+        settings: learning_rate, weight_decay, max_grad_norm, updates_per_buffer are used.
         keep: all valid clips, or of each group the one of highest reward.
         draws: (time, noise) pairs per kept clip and buffer, spread over the updates; a multiple of updates_per_buffer.
         seed: of times and noise (stream `flow_matching`).
@@ -42,7 +42,7 @@ class FlowMatchingLearner:
         if draws % settings.updates_per_buffer:
             raise ValueError(f"{draws} draws cannot be spread over {settings.updates_per_buffer} updates evenly")
         self.model, self.settings, self.rollout, self.seed, self.keep = model, settings, rollout, seed, keep
-        self.draws, self.version = draws, 0
+        self.draws, self.version, self.iterations = draws, 0, 0
         self._flow = load_video_config("base").model.training.with_values(drop=0.0)
         self.parameters = [p for p in model.parameters() if p.requires_grad]
         self._optimizer = torch.optim.AdamW(
@@ -53,13 +53,14 @@ class FlowMatchingLearner:
         """Make updates_per_buffer optimizer steps.
 
         Raises:
-            RolloutBufferError: another sampler configuration, or a stale buffer.
+            RolloutBufferError: another sampler configuration, or other weights.
             FloatingPointError: a gradient is not finite.
         """
-        buffer.check(self.rollout, self.version, self.settings.max_staleness)
+        buffer.check(self.rollout, self.version)
         rows = torch.nonzero(kept_clips(buffer, self.keep))[:, 0]
         updates = tuple(self._update(buffer, rows) for _ in range(self.settings.updates_per_buffer))
-        rewards = mixed_reward(buffer)
+        self.iterations += 1
+        rewards = buffer.reward
         groups = len(set(buffer.group_ids.tolist()))
         return BufferReport(
             updates=updates, reward_mean=float(rewards[buffer.valid].mean()), advantage_abs_mean=NAN,
@@ -85,14 +86,14 @@ class FlowMatchingLearner:
             raise FloatingPointError(f"the gradient is not finite at version {self.version}; lower the learning rate")
         self._optimizer.step()
         self.version += 1
-        return UpdateReport(-float(loss.detach()), NAN, NAN, NAN, NAN, norm, len(repeated), NAN, NAN, NAN)
+        return UpdateReport(-float(loss.detach()), NAN, NAN, NAN, NAN, norm, len(repeated))
 
 
 def kept_clips(buffer: RolloutBuffer, keep: Kept) -> Tensor:
     """Return which clips train, bool (N,): the valid ones, or of each group the valid one of highest reward."""
     if keep == "all":
-        return buffer.valid.clone()
-    rewards = torch.where(buffer.valid, mixed_reward(buffer), -torch.inf)
+        return buffer.valid
+    rewards = torch.where(buffer.valid, buffer.reward, -torch.inf)
     kept = torch.zeros_like(buffer.valid)
     for group in set(buffer.group_ids.tolist()):
         rows = torch.nonzero(buffer.group_ids == group)[:, 0]
@@ -117,13 +118,12 @@ class RecordedTargets(RecordedContexts):
         settings, N = self.config.rollout, len(latents)
         none = latents.new_zeros(N, 0, *latents.shape[1:])
         rollout = VideoRollout(
-            latents, (), (), none, none[:, :, :1], latents.new_zeros(N, 0), none, torch.zeros(N, dtype=torch.int64),
-            latents.new_zeros(0), flow_times(settings.num_steps, settings.shift),
+            latents, (), none, none[:, :, :1], none, latents.new_zeros(0)
         )
         rows = torch.arange(N)
         return RolloutBuffer(
-            rollout, condition, rows, torch.zeros_like(rows), {}, torch.ones(N, dtype=torch.bool),
-            request.policy_version, request.iteration, config_hash(settings),
+            rollout, condition, rows, torch.zeros_like(rows), {}, request.policy_version, request.iteration,
+            config_hash(settings),
         )
 
     def score(self, request: GroupRequest, clips: RolloutBuffer) -> RolloutBuffer:

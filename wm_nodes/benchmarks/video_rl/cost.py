@@ -78,9 +78,15 @@ def measure_anchors(
         for anchor in ANCHORS:
             kl = learner.kl.with_values(anchor=anchor, dual_every=1)
             grpo = GrpoLearner(model, learner.with_values(kl=kl, learning_rate=0.0), rollout, seed=0)
-            updates = grpo.train(buffer).updates
-            for part in PARTS:
-                times[anchor][part].append(sum(getattr(update, f"{part}_seconds") for update in updates))
+            device = device_of(model)
+            with (
+                clocked(grpo.terms, "compute", device=device) as terms,
+                clocked(grpo.terms, "kl", device=device) as kl_alone,
+                clocked(torch.Tensor, "backward", device=device) as backward,
+            ):
+                grpo.train(buffer)
+            for part, spent in zip(PARTS, (terms[0] - kl_alone[0], kl_alone[0], backward[0]), strict=True):
+                times[anchor][part].append(spent)
     weights = sum(p.nbytes for p in model.parameters())
     kept = {"buffer": buffer.rollout.zeta.nbytes + buffer.rollout.mask.nbytes, "frozen": weights}
     kept["dual"] = kept["buffer"] + weights
@@ -156,10 +162,7 @@ def pushcube_buffer(seed: int, device: torch.device) -> tuple[VideoNetwork, tupl
     noise = sampling.initial_noise(shape, index + seed).to(device)
     videos = sampling.sample_videos(network, condition, noise, index + seed, rollout)
     rewards = torch.rand(len(index), generator=torch_stream(seed, "cost_rewards"), dtype=torch.float64)
-    buffer = RolloutBuffer(
-        videos, condition, index // GROUP, index % GROUP, {}, torch.ones(len(index), dtype=torch.bool), 0, 0,
-        config_hash(rollout),
-    )
+    buffer = RolloutBuffer(videos, condition, index // GROUP, index % GROUP, {}, 0, 0, config_hash(rollout))
     return network, (buffer.with_rewards({"total": rewards}), rollout)
 
 

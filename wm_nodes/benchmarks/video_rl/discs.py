@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
+from torch import Tensor
 
 from benchmarks.experiment import Count, OnDevice, console
 from benchmarks.video_rl import tables
@@ -15,17 +16,29 @@ from benchmarks.video_rl.trainings import OnIteration, Trainings
 from benchmarks.video_rl.trials import SamplerTrial, ablation_trials, hacking_trials
 from wm_nodes.config.load import load_video_config
 from wm_nodes.core.files import file_sha256, write_atomic
+from wm_nodes.core.seeding import torch_stream
 from wm_nodes.training.weights import pack_weights
-from wm_nodes.video_model import VideoNetwork
+from wm_nodes.video_model import Condition, VideoNetwork
 from wm_nodes.video_model.flow_matching import train_video_model
-from wm_nodes.video_rl.toy_scene import BASE, NETWORK, load_base, training_batch
+from wm_nodes.video_rl.toy_scene import BASE, NETWORK, NUM_ACTIONS, draw_scenes, load_base
 
 BASE_BATCH = 16
+OBEDIENCE = 0.4
+"""Share of the training videos in which the disc obeys its action for certain; in the others its way is drawn."""
 
 
 def base_of(path: Path | None) -> dict[str, Any]:
     """Which base model was measured; None: the shipped one."""
     return {"sha256": {"base": file_sha256(path or BASE)}}
+
+
+def training_batch(count: int, seed: int, iteration: int) -> tuple[Tensor, Condition]:
+    """Videos (B, C, F, H, W) in which the action is obeyed with probability OBEDIENCE, and their condition."""
+    scenes = draw_scenes(count, seed, "training", iteration)
+    generator = torch_stream(seed, "moving_disc_obedience", iteration)
+    obeys = torch.rand(count, generator=generator) < OBEDIENCE
+    direction = torch.where(obeys, scenes.action, torch.randint(NUM_ACTIONS, (count,), generator=generator))
+    return scenes.videos(direction), scenes.condition()
 
 
 @dataclass(kw_only=True)

@@ -19,6 +19,7 @@ from benchmarks.video_rl import tables
 from benchmarks.video_rl.discs import base_of
 from benchmarks.video_rl.samplers import SamplerSetup, diversity_samplers
 from benchmarks.video_rl.sources import TASK, recorded_episodes, sample_scenes
+from benchmarks.video_rl.spread import centred_pixels, rollout_diversity
 from benchmarks.video_rl.trainings import select, settings_of
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.seed_ranges import HELDOUT
@@ -29,10 +30,9 @@ from wm_nodes.core.statistics import bootstrap_mean
 from wm_nodes.video_model import VideoNetwork
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
-from wm_nodes.video_rl.diversity import rollout_diversity
 from wm_nodes.video_rl.reference_reward import SEEN_MOTION, load_probe
 from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
-from wm_nodes.video_rl.toy_scene import centred_pixels, draw_scenes, load_base, opacity_at
+from wm_nodes.video_rl.toy_scene import draw_scenes, load_base, opacity_at
 from wm_nodes.world_model import Tokenizer, load_model_folder
 from wm_nodes.world_model.positions import columns_of
 

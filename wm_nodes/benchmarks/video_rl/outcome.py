@@ -22,12 +22,13 @@ from benchmarks.video_rl.judged import JudgedContexts, open_judge
 from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.proxy_plot import plot_proxy
 from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers
-from benchmarks.video_rl.sources import TASK, config_of, reward_spread
+from benchmarks.video_rl.sources import TASK, config_of
+from benchmarks.video_rl.spread import reward_spread
 from benchmarks.video_rl.trainings import OnIteration, RecordedTrainings, row_name
 from benchmarks.video_rl.trials import SamplerTrial
 from wm_nodes.apps.options import prepare_torch
 from wm_nodes.config.load import judge_or_embedded, load_config, load_video_config
-from wm_nodes.config.schema import AGENT
+from wm_nodes.config.schema import AGENT, EXECUTION
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.files import write_atomic
@@ -40,9 +41,10 @@ from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_model.success_reader import load_success_reader
+from wm_nodes.video_rl.execution_reward import load_execution_reward
 from wm_nodes.video_rl.heldout_metrics import Yardstick, make_yardstick, measure_clips, measure_executability
 from wm_nodes.video_rl.reference_reward import load_probe, score_clips
-from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.sampling import sample_by_ode
 from wm_nodes.world_model.position_probe import PositionProbe
 
 MEASURES = ("success_path", "success", "outcome", "scenery")
@@ -89,7 +91,7 @@ class OutcomeSource(JudgedContexts):
 
     def validate(self) -> Mapping[str, list[float]]:
         self.folder.network.eval()
-        frames = self.evaluate(self._heldout, self.config.evaluation.num_steps)
+        frames = sample_by_ode(self.folder, self._heldout, self.config, self.config.evaluation.num_steps)
         scores = score_clips(frames, self._heldout, self.probe, self.folder.clip["num_conditioning"]).named()
         return {name: scores[name].tolist() for name in SCORES}
 
@@ -112,7 +114,7 @@ class Outcome(RecordedTrainings[OutcomePlan]):
     def trials(self) -> list[SamplerTrial[OutcomePlan]]:
         plan = OutcomePlan(self.iterations, eval_contexts=self.eval_contexts)
         arms = self.with_rate(outcome_samplers())
-        return [*(SamplerTrial(arm, plan) for arm in arms), judge_trial(arms[0], plan)]
+        return [*(SamplerTrial(arm, plan) for arm in arms), *paid_trials(arms[0], plan)]
 
     def train(self, trial: SamplerTrial[OutcomePlan], seed: int, on_iteration: OnIteration) -> dict[str, Any]:
         folder = self.folder()
@@ -162,8 +164,8 @@ class Outcome(RecordedTrainings[OutcomePlan]):
     def measure_weights(self, weights: Path | None, seed: int) -> dict[str, float]:
         """Return means over the first MEASURED held-out first frames of metrics that were never trained on, of one ODE
         clip each from the noise of `seed`: success by two readers and in the simulator, faults; `accepted`: as a
-        success by the embedded judge, `accepted_executed`: and a success in the simulator, too. weights: None: the
-        base's.
+        success by the embedded judge, `execution_success`: by the action world model, `..._executed`: and a success in
+        the simulator, too. weights: None: the base's.
 
         Raises:
             OSError: no weights are kept.
@@ -172,22 +174,31 @@ class Outcome(RecordedTrainings[OutcomePlan]):
         folder, config = self.folder(), load_video_config("outcome", {"seed": seed})
         if weights is not None:
             load_weights_file(folder.network, weights)
-        frames = ClipGenerator(folder, heldout, config).evaluate(heldout, config.evaluation.num_steps)
+        frames = sample_by_ode(folder, heldout, config, config.evaluation.num_steps)
         positions, given = by.probe.read(frames), folder.clip["num_conditioning"]
         metrics = measure_clips(frames, positions, heldout, by, given)
         metrics |= measure_executability(positions, heldout, by, folder.clip["stride"])
         config = config.with_values(judge=judge_or_embedded(config.judge))
         fps = clip_fps(self.heldout_bags[0], config.model.stride)
-        accepted = _accepted(frames, heldout, config, given, fps)
-        executed = metrics["executed_success"].numpy() * accepted
-        shares = {"accepted": float(accepted.mean()), "accepted_executed": float(executed.mean())}
-        return {name: float(metrics[name].mean()) for name in METRICS} | shares
+        imagined = load_execution_reward(config.with_values(rewards={EXECUTION: 1.0}), folder, heldout, by.probe)
+        done = {"accepted": torch.from_numpy(_accepted(frames, heldout, config, given, fps))}
+        if imagined is not None:
+            done["execution_success"] = imagined.score(frames, heldout)["execution_success"]
+        shares = done | {f"{name}_executed": some * metrics["executed_success"] for name, some in done.items()}
+        return {name: float(values.mean()) for name, values in ({n: metrics[n] for n in METRICS} | shares).items()}
 
 
-def judge_trial(sampler: SamplerSetup, plan: OutcomePlan) -> SamplerTrial[OutcomePlan]:
-    """The same sampler, paid by the embedded judge alone."""
-    judged = replace(plan, rewards=((AGENT, 1.0),))
-    return SamplerTrial(replace(sampler, name=f"{sampler.name}, judge {plan.rubric}"), judged)
+def paid_trials(sampler: SamplerSetup, plan: OutcomePlan) -> list[SamplerTrial[OutcomePlan]]:
+    """The same sampler, paid by the embedded judge alone, by the action world model alone, and by that and the outcome.
+    """
+    rewards: dict[str, tuple[tuple[str, float], ...]] = {
+        f"judge {plan.rubric}": ((AGENT, 1.0),), EXECUTION: ((EXECUTION, 1.0),),
+        f"{EXECUTION} and outcome": ((EXECUTION, 1.0), ("outcome", 0.3)),
+    }
+    return [
+        SamplerTrial(replace(sampler, name=f"{sampler.name}, {name}"), replace(plan, rewards=weights))
+        for name, weights in rewards.items()
+    ]
 
 
 @cache

@@ -27,7 +27,7 @@ from wm_nodes.core.progress import tqdm
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_rl.reference_reward import load_probe, score_clips
-from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.sampling import sample_by_ode
 from wm_nodes.world_model.position_probe import PositionProbe
 
 MODEL, CODEC, ENLARGED, COPY = "model", "codec alone", "the model's own size, enlarged", "first frame repeated"
@@ -111,7 +111,7 @@ class Resolution(OnDevice):
 
 def sample_clips(folder: VideoFolder, contexts: Clips, config: VideoRlConfig) -> Tensor:
     """One ODE clip of each context at the contexts' size, uint8 (E, F, H, W, 3)."""
-    return ClipGenerator(folder, contexts, config).evaluate(contexts, config.evaluation.num_steps)
+    return sample_by_ode(folder, contexts, config, config.evaluation.num_steps)
 
 
 def size_rows(

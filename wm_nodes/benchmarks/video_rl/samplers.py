@@ -15,7 +15,7 @@ LEARNER = BASE.grpo.with_values(learning_rate=1e-4, micro_batch=64)
 """Table 5's clip, advantage clip, KL and step fraction; a learning rate for 76 k parameters instead of billions."""
 CLIP_LEARNER = BASE.grpo.with_values(
     advantage=BASE.grpo.advantage.with_values(std_scope="global", best_of_n=4),
-    kl=BASE.grpo.kl.with_values(mode="none"), trains="condition", logprob_weight="cps", updates_per_buffer=1,
+    kl=BASE.grpo.kl.with_values(beta=0.0), trains="condition", logprob_weight="cps", updates_per_buffer=1,
     step_fraction=1.0, learning_rate=2e-4, weight_decay=0.0,
 )
 """The setting in which the shipped video model was seen to learn from recorded contexts that it was not trained on:
@@ -112,38 +112,23 @@ def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
     others' four steps do, a call with its gradient counted as three.
     """
     nft = learner.with_values(
-        objective="nft", nft=learner.nft.with_values(times=3), kl=learner.kl.with_values(mode="none"),
+        objective="nft", nft=learner.nft.with_values(times=3), kl=learner.kl.with_values(beta=0.0),
         learning_rate=NFT_RATE,
     )
     cps = learner.with_values(logprob_weight="cps")
-    frozen = BASE.grpo.kl.with_values(beta=learner.kl.beta, anchor="frozen")
     plain = sampler_setup("CPS 0.6", by_arm("cps", 0.6), cps)
-    matched = sampler_setup("DynDiff 0.4 sparse, rms, cps", dyndiff(0.4, "sparse", "rms"), cps)
-    sparse = sampler_setup("DynDiff 0.6 sparse, cps", dyndiff(0.6, "sparse"), cps)
     gated = sampler_setup("DynDiff 0.6 gated, rms, cps", dyndiff(0.6, "gated", "rms"), cps)
-    quiet = [
-        sampler_setup("CPS 0.46", by_arm("cps", 0.46), cps),  # spends what DynDiff 0.6 gated, rms does
-        sampler_setup("CPS 0.2", by_arm("cps", 0.2), cps),
-        sampler_setup("DynDiff 0.2 sparse, rms, cps", dyndiff(0.2, "sparse", "rms"), cps),
-    ]
+    quiet = sampler_setup("CPS 0.46", by_arm("cps", 0.46), cps)  # spends what DynDiff 0.6 gated, rms does
     flow = sampler_setup("Flow-GRPO 0.7", by_arm("flow", 0.7), learner)
     return [
         plain, sampler_setup("CPS 0.6, full", by_arm("cps", 0.6), learner),
         flow, replace(_in_window(flow), name="Mix-GRPO 0.7"),
         sampler_setup("DanceGRPO 0.3", by_arm("dance", 0.3), learner),
         sampler_setup("SAGE 0.5", by_arm("sage", 0.5), learner),
-        sampler_setup("DynDiff 0.6 gated", dyndiff(0.6), learner),
-        sampler_setup("DynDiff 0.6 sparse", dyndiff(0.6, "sparse"), learner),
-        sampler_setup("DynDiff 0.4 sparse, rms", dyndiff(0.4, "sparse", "rms"), learner),
-        matched, sparse, gated,
-        *(replace(one, name=f"{one.name}, frozen", grpo=one.grpo.with_values(kl=frozen)) for one in (plain, matched)),
-        *(
-            replace(sampler, name=f"{sampler.name}, shared", shared_noise=True)
-            for sampler in (plain, matched, sparse, gated, *quiet)
-        ),
-        *(replace(_in_window(sampler), name=f"{sampler.name}, window") for sampler in (plain, gated)),
+        sampler_setup("DynDiff 0.6 gated", dyndiff(0.6), learner), gated,
+        *(replace(one, name=f"{one.name}, shared", shared_noise=True) for one in (plain, gated, quiet)),
+        *(replace(_in_window(one), name=f"{one.name}, window") for one in (plain, gated)),
         sampler_setup("signed FM, ODE", by_arm("ode", 0.0), nft),
-        sampler_setup("signed FM, CPS 0.6", by_arm("cps", 0.6), nft),
     ]
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from benchmarks.video_rl.samplers import DiscPlan, LearningPlan, SamplerSetup
+from benchmarks.video_rl.spread import group_spread
 from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.config.seed_ranges import SeedRange
 from wm_nodes.config.video import VideoRlConfig
@@ -16,10 +17,9 @@ from wm_nodes.environments.record import collect_plan, scripted_plan
 from wm_nodes.video_model import RolloutBuffer, VideoNetwork
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_rl.diversity import rollout_diversity
 from wm_nodes.video_rl.group_advantages import group_advantages
 from wm_nodes.video_rl.sampling import RecordedContexts
-from wm_nodes.video_rl.toy_scene import SceneRequest, Scenes, ToyContexts, centred_pixels, draw_scenes
+from wm_nodes.video_rl.toy_scene import SceneRequest, Scenes, ToyContexts, draw_scenes
 from wm_nodes.video_rl.train import ClipSource, Request
 from wm_nodes.video_rl.validation import context_scores
 from wm_nodes.world_model.position_probe import PositionProbe
@@ -54,7 +54,7 @@ class DiscSource(ToyContexts):
 
     def measure(self, buffer: RolloutBuffer) -> dict[str, float]:
         """group_spread, and the largest |A| of DD-13 before it is clipped."""
-        unclipped = group_advantages(buffer.rewards["total"], buffer.group_ids, buffer.valid, clip=math.inf)
+        unclipped = group_advantages(buffer.rewards["total"], buffer.group_ids, clip=math.inf)
         largest = float(unclipped.advantages_N.abs().max())
         return {**group_spread(buffer, self.config.groups.group_size), "advantage_max": largest}
 
@@ -115,21 +115,3 @@ def sample_scenes(
     plan = LearningPlan(contexts=len(scenes), group_size=group_size)
     source, request = ToyContexts(network, config_of(sampler, plan, seed)), SceneRequest(scenes, iteration, 0)
     return source.score(request, source.sample(request))
-
-
-def group_spread(buffer: RolloutBuffer, group_size: int) -> dict[str, float]:
-    """How far the videos of a scene spread, mean over the buffer's scenes.
-
-    rollout_diversity: DD-19 of centred pixels. rollout_reward_std: of the training reward.
-    """
-    latents = buffer.rollout.latents
-    groups = latents.view(-1, group_size, *latents.shape[1:])
-    diversity = sum(rollout_diversity(centred_pixels(videos)) for videos in groups) / len(groups)
-    return {"rollout_diversity": diversity, "rollout_reward_std": reward_spread(buffer)}
-
-
-def reward_spread(buffer: RolloutBuffer) -> float:
-    """Standard deviation of the training reward within a group, mean over the groups; of the valid videos."""
-    groups = sorted(set(buffer.group_ids[buffer.valid].tolist()))
-    rewards = (buffer.rewards["total"][buffer.valid & (buffer.group_ids == group)] for group in groups)
-    return sum(float(values.std(correction=0)) for values in rewards) / max(1, len(groups))

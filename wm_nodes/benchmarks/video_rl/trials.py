@@ -40,10 +40,10 @@ def ablation_trials(learner: GrpoConfig, plan: DiscPlan) -> tuple[list[SamplerTr
     trials = [
         SamplerTrial(base, plan),
         SamplerTrial(_learning(base, "KL of log-probabilities", kl=other_kl), plan),
-        SamplerTrial(_learning(base, "no KL", kl=plain.kl.with_values(mode="none")), plan),
+        SamplerTrial(_learning(base, "no KL", kl=plain.kl.with_values(beta=0.0)), plan),
         SamplerTrial(_learning(base, "clip 2.5, groups of 16"), groups),
         SamplerTrial(_learning(base, "clip 5, groups of 16", advantage=wide), groups),
-        SamplerTrial(replace(_learning(base, "guidance 2", cfg=GUIDANCE), rollout=guided), half),  # two calls per step
+        SamplerTrial(replace(base, name="guidance 2", rollout=guided), half),  # two calls per step
         SamplerTrial(replace(base, name="trained at 16, shown at 20"), high),
         SamplerTrial(replace(base, name="trained and shown at 20"), replace(high, side=HIGH_SIDE)),
     ]

@@ -45,6 +45,7 @@ GROUPS = {
     },
     "recordings": {
         "collect": "episodes of tasks in the simulator, planned and scripted",
+        "view": "a recording, or a run, on a live page of this host",
         "rescore": "score a recording again, compare bit for bit",
         "retrain": "train a video model again on a run's recorded clips and scores",
         "recover-bag": "bring back a recording whose process was killed",
@@ -76,6 +77,7 @@ GROUPS = {
         "benchmark closed-loop": "a video model that goes on from its own frames, with controls",
         "benchmark erring": "the reward agent under a judge that errs",
         "benchmark success-clips": "any judge on other people's labelled episodes",
+        "benchmark tables": "the full tables of the result pages, from the result files",
     },
 }
 VERBS = {name: about for verbs in GROUPS.values() for name, about in verbs.items()}

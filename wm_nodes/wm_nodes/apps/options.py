@@ -12,6 +12,8 @@ import torch
 
 from wm_nodes.config.load import POLICY, VIDEO, Config, judge_overrides, preset_names
 from wm_nodes.core.memory import keep_freed_memory
+from wm_nodes.launching.scenarios import PAGE
+from wm_nodes.reports.live_page import HOST, free_port
 from wm_nodes.training.run_lock import RunLock
 from wm_nodes.training.run_record import Starter, take_up
 
@@ -38,7 +40,7 @@ def add_settings(parser: argparse.ArgumentParser, loop: str = POLICY) -> None:
     """Every setting of a loop, or of its judge alone, as an option: cli.Parser puts those given into
     `arguments.settings`, by their dotted names."""
     if parser.get_default("settings_of") is None:
-        example = {POLICY: "ppo.updates 10", VIDEO: "grpo.clip_low 0.1", JUDGE: "judge.max_reads 3"}[loop]
+        example = {POLICY: "ppo.updates 10", VIDEO: "grpo.clip 0.1", JUDGE: "judge.max_reads 3"}[loop]
         parser.add_argument(
             "--SECTION.KEY", metavar="VALUE", help=f"one of the {loop} settings below, in YAML, e.g. --{example}"
         )
@@ -90,6 +92,23 @@ def add_graph(parser: argparse.ArgumentParser) -> None:
     """Options of verbs that start a ROS graph."""
     parser.add_argument("--domain-id", default="", help="ROS domain 0 to 101 (default: $ROS_DOMAIN_ID, else 0)")
     parser.add_argument("--verbose", action="store_true", help="show the nodes' logs (they are in <run>/logs anyway)")
+
+
+def add_view(parser: argparse.ArgumentParser) -> None:
+    """--view; take_port reads it."""
+    parser.add_argument(
+        "--view", nargs="?", const="0", default="", metavar="PORT",
+        help="open a live page for this host: pictures, done signal, curves, verdicts, nodes (port: a free one)",
+    )
+
+
+def take_port(arguments: argparse.Namespace) -> None:
+    """Make `arguments.view` the launch arguments that --view stands for, and say where the page will be. Raises
+    ValueError: as free_port."""
+    given = arguments.view
+    arguments.view = {"view": PAGE, "view_port": free_port(given)} if given else {}
+    if given:
+        print(f"live page http://{HOST}:{arguments.view['view_port']}/", flush=True)
 
 
 def add_tensorboard(parser: argparse.ArgumentParser) -> None:

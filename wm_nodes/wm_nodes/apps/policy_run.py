@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +61,8 @@ class RunContext:
     """As the launch argument."""
     video_model: str = ""
     """Folder of the video model to train in; empty: the world model."""
+    view: Mapping[str, str] = field(default_factory=dict)
+    """The launch arguments of the live page; none: no page."""
 
     @property
     def measures(self) -> bool:
@@ -133,7 +135,7 @@ def start_graph(job: RunContext, start: TrainingStart) -> WaitingGraph:
         "reward": job.reward, "run_dir": str(start.folder),
         "model_dir": str(start.model_dir), "starts_file": str(start.starts), "first_frames_file": str(job.starts),
         "initial_policy": str(start.policy), "bag_uri": str(bag), "domain_id": job.domain_id,
-        "compose": "true" if job.compose else "false", "autostart": "false", **job.environment,
+        "compose": "true" if job.compose else "false", "autostart": "false", **job.environment, **job.view,
     })
     job.stage("starting the graph: " + ", ".join(node.label for node in graph.nodes))
     runner = Runner(graph, log_dir=start.folder / "logs", log=sys.stdout if job.verbose else None)

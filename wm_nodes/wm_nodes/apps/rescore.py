@@ -45,6 +45,7 @@ from wm_nodes.training.run_record import CONFIG
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl import recorded_buffers
+from wm_nodes.video_rl.execution_reward import load_execution_reward
 from wm_nodes.video_rl.recorded_buffers import BufferJudge, JudgedBuffer, RecordedClips, Rescored
 from wm_nodes.video_rl.reference_reward import load_probe
 from wm_nodes.video_rl.sampling import recorded_place
@@ -57,8 +58,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", type=Path, help="run folder, or a bag of train-policy")
     parser.add_argument(
         "--reward", choices=REWARDS,
-        help="agent: a judge's verdicts; reference: how well clips follow their recordings; closeness: how alike they "
-        "look (default: as recorded)",
+        help="agent: a judge's verdicts; execution: what the action world model makes of their motion; reference: how "
+        "well clips follow their recordings; closeness: how alike they look (default: as recorded)",
     )
     add_judge(parser)
     add_device(parser)
@@ -153,6 +154,7 @@ def _clips(arguments: argparse.Namespace, run_dir: Path) -> Outcome:
     probe, folder = load_probe(shipped_model(config.task), device), load_video_folder(run_dir / "video_model", device)
     bags = recorded_buffers.recorded_episodes(run_dir, "train")
     contexts = load_clips(bags, config.model.stride, config.clip_steps)
+    execution = load_execution_reward(config, folder, contexts, probe)
     with _clip_judge(config, run_dir, contexts, clip_fps(bags[0], config.model.stride)) as judge:
         recordings = recorded_buffers.recorded_bags(run_dir)
         clips = chain.from_iterable(recorded_buffers.read_clips(recording, pictures=True) for recording in recordings)
@@ -160,7 +162,7 @@ def _clips(arguments: argparse.Namespace, run_dir: Path) -> Outcome:
         for recorded in tqdm(clips, desc="rescoring", unit="buffer"):
             first, given = recorded_place(config, recorded.iteration)
             rows.append(recorded_buffers.rescore(
-                recorded, contexts, probe, folder.codec, config.rewards, given, judge, first
+                recorded, contexts, probe, folder.codec, config.rewards, given, judge, first, execution
             ))
     equal = all(not row.different for row in rows)
     words = "every score is the recorded one, bit for bit" if equal else "scores differ from the bag's"

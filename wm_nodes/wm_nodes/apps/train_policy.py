@@ -86,6 +86,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     options.add_judge(parser)
     parser.add_argument("--compose", action="store_true", help="all nodes in one process")
+    options.add_view(parser)
     options.add_graph(parser)
     parser.set_defaults(**dict.fromkeys([*FIXED, *FREE]))
 
@@ -93,6 +94,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Collect, check the world model, clone a weak policy, train it in the world model, measure it in the simulator."""
     options.prepare_torch()
+    options.take_port(arguments)
     with opened(arguments) as (config, run_dir):
         _run(arguments, config, run_dir)
 
@@ -113,7 +115,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
     starts, weak = start_files(run_dir)
     job = RunContext(
         config, run_dir, starts, stage, arguments.domain_id, arguments.compose, arguments.verbose, arguments.reward,
-        str(arguments.video_model or ""),
+        str(arguments.video_model or ""), arguments.view,
     )
     with ExitStack() as stack:
         first, waiting = round_start(job, 1, model_dir, weak), None

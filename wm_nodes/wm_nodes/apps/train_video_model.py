@@ -71,11 +71,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--reward", choices=REWARDS,
-        help="agent: a judge's verdict on each clip; reference: how well the clip follows its recording; closeness: "
-        "how alike both look, which needs no simulator state. Default: what the preset weighs",
+        help="agent: a judge's verdict on each clip; execution: whether the task gets done when the action world model "
+        "follows the clip's motion (with --preset outcome); reference: how well the clip follows its recording; "
+        "closeness: how alike both look, which needs no simulator state. Default: what the preset weighs",
     )
     options.add_judge(parser)
     options.add_tensorboard(parser)
+    options.add_view(parser)
     options.add_graph(parser)
     parser.set_defaults(**dict.fromkeys(["preset", "from_scratch", *FREE]))
 
@@ -83,6 +85,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Take or record episodes, take or train a video model, run GRPO over the graph, measure, report."""
     options.prepare_torch()
+    options.take_port(arguments)
     with opened(arguments) as (config, run_dir):
         _run(arguments, config, run_dir)
 
@@ -160,7 +163,7 @@ def _post_train(
         "bag_uri": str(run_dir / "bags" / f"world_model_rl_{time.strftime('%Y%m%d_%H%M%S')}"),
         "video_model_dir": str(run_dir / "video_model"), "context_bags": contexts, "heldout_bags": heldout,
         "keep_buffers": str(arguments.keep_buffers), "tensorboard": "true" if arguments.tensorboard else "false",
-        "domain_id": arguments.domain_id,
+        "domain_id": arguments.domain_id, **arguments.view,
     })
     stage("starting the graph: " + ", ".join(node.label for node in graph.nodes))
     with Runner(graph, log_dir=run_dir / "logs", log=sys.stdout if arguments.verbose else None) as runner:

@@ -30,13 +30,13 @@ from wm_nodes.reports.summary import as_first_made, write_summary
 from wm_nodes.training.metrics import FILE_NAME, read_metrics
 from wm_nodes.training.weights import load_weights_file
 from wm_nodes.video_model.clips import Clips
-from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_model.success_reader import reader_of
 from wm_nodes.video_rl.heldout_metrics import load_or_measure_unrewarded, make_yardstick
 from wm_nodes.video_rl.pretraining import BEFORE
 from wm_nodes.video_rl.reference_reward import more_is_better
-from wm_nodes.video_rl.sampling import ClipGenerator
-from wm_nodes.video_rl.training_run import evaluated_uri
+from wm_nodes.video_rl.sampling import sample_by_ode
+from wm_nodes.video_rl.training_run import VIDEO_FILES
 from wm_nodes.video_rl.validation import SECTION, WATCHED, alarm_text, alarms_of, load_or_measure_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
@@ -55,9 +55,8 @@ def conclude(
         OSError: the version's weights are gone.
     """
     base_folder, trained = (load_video_folder(base, compute_device(config.device)) for _ in range(2))
-    uri = evaluated_uri(version, config)
     if version:
-        load_weights_file(trained.network, run_dir / uri)
+        load_weights_file(trained.network, run_dir / VIDEO_FILES.uri(version))
     before = load_or_measure_scores(run_dir / BEFORE, base_folder, heldout, probe, config)
     after = load_or_measure_scores(run_dir / AFTER, trained, heldout, probe, config)
     device, shipped = compute_device(config.device), shipped_model(config.task)
@@ -71,7 +70,7 @@ def conclude(
     watched = [line for line in lines if line.get("hacked") is not None]
     summary = as_first_made(run_dir, ClipSummary(
         task=config.task, preset=preset, seed=config.seed, iterations=iterations, version=version,
-        weights="averaged" if config.grpo.ema_decay > 0 else "last", contexts=len(before["success"]),
+        contexts=len(before["success"]),
         scores={
             name: score_change(name, before[name], after[name], config.seed) for name in TITLES if name in before
         },
@@ -88,8 +87,7 @@ def conclude(
         bag=bag, minutes=minutes, command=command, machine=machine_facts(config.device), date=time.strftime("%Y-%m-%d"),
     ))
     path = write_summary(run_dir, summary)
-    generators = [ClipGenerator(folder, heldout, config) for folder in (base_folder, trained)]
-    strips = _strips(config, run_dir, heldout, generators)
+    strips = _strips(config, run_dir, heldout, (base_folder, trained))
     drawn = curves(
         run_dir / FILE_NAME, run_dir / "pictures" / "curves.png", clip_panels(config.grpo.updates_per_buffer),
         step="buffers trained on",
@@ -111,10 +109,10 @@ def score_change(name: str, before: Sequence[float], after: Sequence[float], see
     return ScoreChange(float(np.mean(before)), float(np.mean(after)), difference, low, high, verdict)
 
 
-def _strips(config: VideoRlConfig, run_dir: Path, heldout: Clips, generators: Sequence[ClipGenerator]) -> list[Picture]:
+def _strips(config: VideoRlConfig, run_dir: Path, heldout: Clips, folders: Sequence[VideoFolder]) -> list[Picture]:
     """The recording, the base model and the trained model from the same first frames and noise."""
     shown = heldout.select(torch.arange(min(STRIPS, len(heldout))))
-    frames = [generator.evaluate(shown, config.evaluation.num_steps).cpu() for generator in generators]
+    frames = [sample_by_ode(folder, shown, config, config.evaluation.num_steps).cpu() for folder in folders]
     rows = dict(zip(("recorded", "before", "after"), [shown.frames, *frames], strict=True))
     pictures, given = [], "first frame" if config.groups.hide_actions else "first frame and actions"
     for index, instruction in enumerate(shown.instructions):

@@ -15,7 +15,7 @@ import yaml
 from pydantic import ValidationError
 
 from wm_nodes.config.judge import JudgeConfig
-from wm_nodes.config.schema import AGENT, RunConfig
+from wm_nodes.config.schema import AGENT, EXECUTION, RunConfig
 from wm_nodes.config.sections import SettingsSection
 from wm_nodes.config.tasks import get_task, task_names
 from wm_nodes.config.video import VideoRlConfig
@@ -24,14 +24,15 @@ PRESETS = resources.files("wm_nodes.config") / "presets"
 POLICY, VIDEO = "policy", "video"
 """Folders of presets, one for each loop."""
 SCHEMAS: dict[str, type[RunConfig] | type[VideoRlConfig]] = {POLICY: RunConfig, VIDEO: VideoRlConfig}
-FREE = ("behaviours", "rewards", "extra_body", "kwargs")
+FREE = ("behaviours", "rewards", "extra_body", "kwargs", "cameras")
 """Mappings without fixed keys, which are replaced as a whole."""
 RECORD = "run"
 """Section of a run's config.yaml that is no setting: training/run_record.py keeps there what else decides the run."""
 EMBEDDED = "embedded"
 """JudgeConfig.kind of the judge in this process."""
-REWARDS = ("reference", "closeness", AGENT)
-"""Rewards of the video model: its scores against the recording, how alike both look, or a judge's verdicts."""
+REWARDS = ("reference", "closeness", AGENT, EXECUTION)
+"""Rewards of the video model: its scores against the recording, how alike both look, a judge's verdicts, or whether the
+action world model gets the task done by the clip's motion."""
 
 Config = TypeVar("Config", RunConfig, VideoRlConfig)
 

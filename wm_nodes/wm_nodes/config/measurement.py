@@ -39,6 +39,9 @@ class AcceptanceConfig(SettingsSection):
     this share of that of the first frame."""
     other_actions_ratio: PositiveFloat = 1.0
     """The same distance under another episode's actions must be at least so many times that under the recorded ones."""
+    varying_error_ratio: PositiveFloat = 1.0
+    """Of encoded and decoded frames: nine tenths of the pixels that vary between episodes at one step must have a
+    squared error below this share of their variance, at every step."""
     done_precision: Fraction
     """Least precision of the done signal."""
     done_recall: Fraction

@@ -24,6 +24,8 @@ from wm_nodes.config.tasks import check_task, instruction
 
 AGENT = "agent"
 """Name of the reward agent among the rewards of both loops."""
+EXECUTION = "execution"
+"""Name of the reward of clips by an action world model, see video_rl/execution_reward.py."""
 
 TaskName = Annotated[
     str, BeforeValidator(lambda name: name or ""), AfterValidator(lambda name: name and check_task(name))
@@ -74,6 +76,9 @@ class DataConfig(SettingsSection):
     before its success."""
     policy_episodes: Annotated[int, Field(ge=0, le=10_000)]
     """Episodes of each weak cloned policy (policy_rl/pretraining.py) added to the world model's data; 0: none."""
+    ground_truth: bool
+    """False: wm train-model leaves the ground truth of recordings unread. Nothing is then supervised by positions, the
+    policy sees none, and the model is judged by its pictures and done signal; success is the flag that was recorded."""
 
 
 class TokenizerConfig(SettingsSection):
@@ -99,8 +104,11 @@ class TokenizerConfig(SettingsSection):
     """Weight of the loss that keeps the encoder's output near its code; lfq only."""
     foreground_weight: NonNegativeFloat
     """Extra weight of foreground pixels."""
+    worst_weight: NonNegativeFloat = 0.0
+    """Without ground truth: weight of the loss of each frame's worst pixels, against losing small things."""
     probe_weight: NonNegativeFloat = 0.1
-    """Weight of the loss of the positions that a probe reads off the latents."""
+    """Weight of the loss of the positions that a probe reads off the latents; without ground truth, of the action and
+    the success that were recorded with the frame."""
     probe_depth: PositiveInt = 1
     """Hidden layers of the probe."""
     probe_iterations: NonNegativeInt = 0

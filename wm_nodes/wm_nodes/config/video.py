@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from wm_nodes.config.judge import JudgeConfig
-from wm_nodes.config.schema import AGENT, DeviceName, TaskName
+from wm_nodes.config.schema import AGENT, EXECUTION, DeviceName, TaskName
 from wm_nodes.config.sections import (
     Fraction,
     NonNegativeFloat,
@@ -65,6 +65,13 @@ class VideoModelConfig(SettingsSection):
         return self
 
 
+class ExecutionConfig(SettingsSection):
+    """The reward `execution`."""
+
+    model: str
+    """Folder of the world model whose action model follows the clips; empty: the shipped one of the task."""
+
+
 class GroupConfig(SettingsSection):
     contexts: PositiveInt
     """Per iteration."""
@@ -98,13 +105,13 @@ class VideoEvaluationConfig(SettingsSection):
 class WindowConfig(SettingsSection):
     """Which sampler steps are stochastic."""
 
-    strategy: Literal["all", "progressive", "random", "fast"]
-    """all: every step. Else a window of `size` steps. progressive: it moves on by one every `period` iterations;
-    random: it is drawn anew each iteration; fast: so, in the first half (Flow-GRPO-Fast)."""
+    strategy: Literal["all", "progressive"]
+    """all: every step; progressive: a window of `size` steps that moves on by one every `period` iterations (Mix-GRPO).
+    """
     size: PositiveInt
     """Steps in the window."""
     period: PositiveInt
-    """Iterations at one place, with `progressive`."""
+    """Iterations at one place."""
 
 
 class MaskConfig(SettingsSection):
@@ -147,14 +154,12 @@ class RolloutConfig(SettingsSection):
     shift: PositiveFloat
     """Of the flow times towards the noise; 1: none."""
     cfg: float
-    """Classifier-free guidance g of v_u + g (v_c - v_u); 1: off."""
+    """Classifier-free guidance g of v_u + g (v_c - v_u), of rollout and training; 1: off."""
     sampler: SamplerConfig
     """What a step draws from."""
     storage_dtype: Literal["float32", "bfloat16"]
-    """Of the kept latents; a state is rounded to it before its log-probability is taken."""
-    noise_store: Literal["zeta", "zeta_bfloat16"]
-    """What is kept of each step's noise. zeta: all, as large as the latents; zeta_bfloat16: half as large, with a KL of
-    1e-6 at its own anchor."""
+    """Of the kept latents and of each step's noise. A state is rounded to it before its log-probability is taken; noise
+    in bfloat16 has a KL of 1e-6 at its own anchor."""
     micro_batch: PositiveInt
     """Videos per network call."""
     buffer_device: Literal["model", "cpu"]
@@ -171,10 +176,10 @@ class AdvantageConfig(SettingsSection):
 
 
 class KlConfig(SettingsSection):
-    mode: Literal["mean", "logk2", "velocity", "none"]
-    """mean: DD-17, of the means of a step; logk2: of log-probabilities; velocity: of velocities (DD-17a)."""
+    mode: Literal["mean", "logk2"]
+    """mean: DD-17, of the means of a step; logk2: of log-probabilities (DD-17a). With objective nft: of velocities."""
     beta: NonNegativeFloat
-    """Weight."""
+    """Weight; 0: no KL."""
     anchor: Anchor
     """buffer: what sampled; frozen: the model as it was at the start; lora_off: the same with the adapter switched off;
     dual: buffer always, and frozen on every `dual_every`-th update."""
@@ -209,20 +214,14 @@ class GrpoConfig(SettingsSection):
     """Distance to an anchor, which is added to the loss."""
     trains: Literal["all", "condition"]
     """Every parameter that asks for a gradient, or those that carry the condition alone."""
-    clip_low: NonNegativeFloat
-    """The probability ratio is clipped to [1 - clip_low, 1 + clip_high]."""
-    clip_high: NonNegativeFloat
-    """See clip_low."""
-    logprob_weight: Literal["full", "cps", "base"]
+    clip: NonNegativeFloat
+    """The probability ratio is clipped to [1 - clip, 1 + clip]."""
+    logprob_weight: Literal["full", "cps"]
     """Weight of an element in the ratio (DD-14c)."""
     updates_per_buffer: PositiveInt
     """Optimizer steps on one buffer, each on all of it."""
     step_fraction: Fraction
     """Share of the stochastic steps that train, drawn per video."""
-    min_s: NonNegativeFloat
-    """Steps that end below this time never train."""
-    cfg: float
-    """Guidance of the training pass."""
     micro_batch: PositiveInt
     """Transitions per network call."""
     learning_rate: NonNegativeFloat
@@ -231,21 +230,14 @@ class GrpoConfig(SettingsSection):
     """Of AdamW."""
     max_grad_norm: PositiveFloat
     """A longer gradient is scaled to it."""
-    ema_decay: Annotated[float, Field(ge=0, lt=1)]
-    """Decay of the average of the weights that is evaluated; 0: none."""
-    max_staleness: NonNegativeInt
-    """Optimizer steps between sampling and training that are still accepted."""
 
     @model_validator(mode="after")
     def _nft_has_no_transition(self) -> Self:
         """DiffusionNFT knows clips and velocities alone: no buffer of step noise, no likelihood."""
-        kl = self.kl
-        if self.objective == "nft" and kl.mode != "none" and (
-            kl.mode != "velocity" or kl.anchor in ("buffer", "dual")
-        ):
+        if self.objective == "nft" and self.kl.beta and self.kl.anchor in ("buffer", "dual"):
             raise ValueError(
-                f"objective nft has no transitions, got kl.mode {kl.mode} with kl.anchor {kl.anchor}; take kl.mode "
-                "none, or velocity with kl.anchor frozen or lora_off"
+                f"objective nft has no transitions, got kl.beta {self.kl.beta} with kl.anchor {self.kl.anchor}; take "
+                "kl.beta 0, or kl.anchor frozen or lora_off"
             )
         return self
 
@@ -270,8 +262,10 @@ class VideoRlConfig(SettingsSection):
     others are refused."""
     rewards: dict[str, float]
     """Weight of each reward: a score against the recording (video_rl/reference_reward.py), of which `closeness`,
-    `ssim`, `perceptual`, `psnr_db`, `scenery` need no simulator state; or `agent`, which needs a judge. Several are
-    added, e.g. {outcome: 0.5, agent: 0.5}."""
+    `ssim`, `perceptual`, `psnr_db`, `scenery` need no simulator state; `agent`, which needs a judge; or `execution`,
+    by an action world model (video_rl/execution_reward.py). Several are added, e.g. {outcome: 0.5, agent: 0.5}."""
+    execution: ExecutionConfig
+    """Where `execution` is among the rewards."""
     judge: JudgeConfig
     """Where the agent is among the rewards."""
     model: VideoModelConfig
@@ -304,5 +298,10 @@ class VideoRlConfig(SettingsSection):
             raise ValueError(
                 "a judge sees whole episodes, and groups.history makes parts of them; set rewards.agent 0, or "
                 "groups.history 0"
+            )
+        if self.groups.history and self.rewards.get(EXECUTION):
+            raise ValueError(
+                "an action world model follows clips from a recorded first frame, and groups.history begins them with "
+                "frames that were made; set rewards.execution 0, or groups.history 0"
             )
         return self

@@ -1,4 +1,5 @@
-"""Every task as a Gymnasium environment, wm/<task>-v0; importing this module registers them.
+"""Every task as a Gymnasium environment, wm/<task>-v0; importing this module registers them. policy_rl/gym.py has the
+world model.
 
     import wm_nodes.environments.gym
     env = gymnasium.make("wm/push-v0", scenes="train", image_size=128)
@@ -10,15 +11,12 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.tasks import task_names
 from wm_nodes.core.types import FloatArray, Observation, UInt8Array
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-
-MARGIN = np.float32(1)
-"""A start may lie outside of the box that actions keep the state in."""
+from wm_nodes.environments.spaces import action_space, observation_space
 
 
 class TaskEnv(gymnasium.Env[dict[str, Any], FloatArray]):
@@ -41,12 +39,7 @@ class TaskEnv(gymnasium.Env[dict[str, Any], FloatArray]):
         spec = self._env.spec
         self.metadata = {**self.metadata, "render_fps": config.simulation.control_hz}
         self.render_mode = render_mode
-        low, high = (np.array(edge, np.float32) for edge in (spec.state_low, spec.state_high))
-        self.observation_space = spaces.Dict({
-            "image": spaces.Box(0, 255, (spec.height, spec.width, 3), np.uint8),
-            "state": spaces.Box(low - MARGIN, high + MARGIN),
-        })
-        self.action_space = spaces.Box(-1, 1, (spec.action_dim,), np.float32)
+        self.observation_space, self.action_space = observation_space(spec), action_space(spec)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

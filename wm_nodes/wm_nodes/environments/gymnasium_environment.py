@@ -10,18 +10,17 @@ import cv2
 import gymnasium
 import numpy as np
 
-from wm_nodes.config.environments import GymnasiumConfig
+from wm_nodes.config.environments import CAMERAS, RENDER, GymnasiumConfig
 from wm_nodes.core.specs import SOURCE_SIMULATOR, EnvironmentSpec
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.environments.batch import EnvironmentBatch, Frame
-
-RENDER = "render"
-"""gymnasium.pixels of an environment whose picture is what it renders."""
+from wm_nodes.environments.mujoco_cameras import MujocoCameras, choose_headless
 
 
 def gymnasium_environment(config: GymnasiumConfig, num_envs: int, seed: int) -> EnvironmentBatch:
     """Make num_envs copies. Raises ValueError: an environment that does not exist or does not fit the settings."""
-    copies = [GymnasiumCopy(config) for _ in range(num_envs)]
+    cameras = MujocoCameras(config.cameras, config.image_size)
+    copies = [GymnasiumCopy(config, cameras) for _ in range(num_envs)]
     return EnvironmentBatch(copies[0].spec(), copies, seed)
 
 
@@ -32,9 +31,11 @@ class GymnasiumCopy:
     here.
     """
 
-    def __init__(self, config: GymnasiumConfig) -> None:
-        self._config = config
+    def __init__(self, config: GymnasiumConfig, cameras: MujocoCameras) -> None:
+        self._config, self._cameras = config, cameras
         rendered = {"render_mode": "rgb_array"} if config.pixels == RENDER else {}
+        if config.pixels == CAMERAS:
+            choose_headless()
         try:
             self._env: gymnasium.Env[Any, Any] = gymnasium.make(config.env_id, **{**rendered, **config.kwargs})
         except (gymnasium.error.Error, ImportError, TypeError) as error:
@@ -45,7 +46,7 @@ class GymnasiumCopy:
         box = self._env.action_space
         if not isinstance(box, gymnasium.spaces.Box) or box.shape != (box.low.size,) or not box.is_bounded():
             raise ValueError(f"{config.env_id} takes actions of {box}; only a bounded, flat Box can be scaled")
-        self._middle, self._half = (box.high + box.low) / 2, (box.high - box.low) / 2
+        self._middle, self._half = (box.high + box.low) / 2, config.action_scale * (box.high - box.low) / 2
 
     def spec(self) -> EnvironmentSpec:
         config, made = self._config, self._env.spec
@@ -53,11 +54,11 @@ class GymnasiumCopy:
         if not limit:
             raise ValueError(f"{config.env_id} sets no limit to an episode; give gymnasium.kwargs max_episode_steps")
         height, width = config.image_size
-        observed = self._env.observation_space.sample()
-        states = [f"{key}.{i}" for key in config.state for i in range(np.size(_part(observed, key)))]
+        cameras = tuple(config.cameras) if config.pixels == CAMERAS else (config.pixels,)
+        states = list(self._state(self._env.observation_space.sample()))
         return EnvironmentSpec(
             env_id=f"gymnasium/{config.env_id}", task=config.env_id, instruction=config.instruction,
-            source=SOURCE_SIMULATOR, num_envs=1, height=height, width=width, cameras=(config.pixels,),
+            source=SOURCE_SIMULATOR, num_envs=1, height=height, width=width * len(cameras), cameras=cameras,
             action_names=tuple(f"action.{i}" for i in range(len(self._half))), action_units=("1",) * len(self._half),
             action_scale=tuple(map(float, self._half)), state_names=tuple(states), state_units=("1",) * len(states),
             ground_truth_names=(), control_period_s=1 / float(self._env.metadata.get("render_fps") or 10),
@@ -74,18 +75,37 @@ class GymnasiumCopy:
         return self._frame(observed, success, bool(terminated or truncated))
 
     def close(self) -> None:
+        self._cameras.close()
         self._env.close()
 
     def _frame(self, observed: Any, success: bool = False, over: bool = False) -> Frame:
         pixels = self._config.pixels
-        image: UInt8Array = np.asarray(self._env.render() if pixels == RENDER else _part(observed, pixels))
+        if pixels == CAMERAS:
+            image = self._cameras(self._env.unwrapped)
+        else:
+            image = self._resized(np.asarray(self._env.render() if pixels == RENDER else _part(observed, pixels)))
+        return Frame(image, np.array([*self._state(observed).values()], np.float32), success, over)
+
+    def _resized(self, image: UInt8Array) -> UInt8Array:
+        pixels = self._config.pixels
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
             raise ValueError(f"gymnasium.pixels {pixels!r} gives {image.dtype} {image.shape}, not uint8 (H, W, 3)")
         height, width = self._config.image_size
         if image.shape[:2] != (height, width):
             image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        parts = [np.ravel(_part(observed, key)) for key in self._config.state]
-        return Frame(image, np.concatenate([np.zeros(0), *parts]).astype(np.float32), success, over)
+        return image
+
+    def _state(self, observed: Any) -> dict[str, float]:
+        """The values of the state, by their names."""
+        values = dict[str, float]()
+        for name in self._config.state:
+            key, dot, index = name.rpartition(".")
+            one = bool(dot) and index.isdigit()
+            part = np.ravel(_part(observed, key if one else name))
+            if one and int(index) >= len(part):
+                raise ValueError(f"gymnasium.state names {name}, and {key} has {len(part)} values")
+            values |= {name: part[int(index)]} if one else {f"{name}.{i}": value for i, value in enumerate(part)}
+        return values
 
 
 def _part(observed: Any, key: str) -> Any:

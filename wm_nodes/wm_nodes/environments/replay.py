@@ -3,14 +3,10 @@
 Shapes: N clips, F frames, P ground truth. Positions in m, world frame.
 """
 
-import multiprocessing as mp
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from wm_nodes.config.schema import SimulationConfig
@@ -34,8 +30,7 @@ class Executed:
 
 
 def execute_paths(
-    task: str, simulation: SimulationConfig, seeds: Sequence[int], paths: FloatArray, objects: FloatArray, stride: int,
-    *, num_workers: int = 1,
+    task: str, simulation: SimulationConfig, seeds: Sequence[int], paths: FloatArray, objects: FloatArray, stride: int
 ) -> Executed:
     """Follow each tool path (N, F, 3) from the scene of its reset seed, `stride` control steps from frame to frame.
 
@@ -46,7 +41,6 @@ def execute_paths(
     Args:
         simulation: of the recordings that the clips begin with.
         objects: the imagined final places of the object, (N, 2).
-        num_workers: processes; with 1 none is started. The result does not depend on it.
 
     Raises:
         ValueError: arrays do not belong together, or a path is not finite.
@@ -57,17 +51,7 @@ def execute_paths(
                          f"{objects.shape}; give one of each per clip")
     if not np.isfinite(paths).all():
         raise ValueError(f"path {int(np.flatnonzero(~np.isfinite(paths).all((1, 2)))[0])} is not finite; leave it out")
-    follow = partial(_follow, task, simulation, stride)
-    parts = np.array_split(np.arange(len(seeds)), min(num_workers, len(seeds)))
-    jobs = [[seeds[i] for i in part] for part in parts], [paths[part] for part in parts]
-    if len(parts) == 1:
-        truths = [follow(jobs[0][0], jobs[1][0])]
-    else:
-        with ProcessPoolExecutor(
-            len(parts), mp_context=mp.get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
-        ) as pool:
-            truths = list(pool.map(follow, *jobs))
-    return _compare(task, np.concatenate(truths), paths, objects)
+    return _compare(task, _follow(task, simulation, stride, seeds, paths), paths, objects)
 
 
 def _follow(

@@ -27,6 +27,7 @@ from wm_nodes.launching.graph import Graph, GraphError, compose
 from wm_nodes.launching.scenarios import (
     IMAGINED,
     JUDGE,
+    PAGE,
     REAL,
     argument_table,
     build_graph,
@@ -35,11 +36,12 @@ from wm_nodes.launching.scenarios import (
     run_folder,
     scenario_of,
 )
+from wm_nodes.reports.live_page import free_port
 from wm_nodes.training.run_record import PRESET, Starter, take_up
 
 OF_ONE_START = (
     "run_dir", "allowed_dirs", "domain_id", "discovery_range", "python", "log_level", "executor", "autostart",
-    "use_sim_time", "respawn", "memory_limit_gib", "compose",
+    "use_sim_time", "respawn", "memory_limit_gib", "compose", "view", "view_port",
 )
 """Arguments that a run does not keep."""
 FREE = ("namespace", "params_file", "record", "bag_uri", "rate", "train", "keep_buffers", "tensorboard")
@@ -162,6 +164,8 @@ def _resolve(scenario: str, values: Mapping[str, str], config: RunConfig | Video
     filled = {**values, "seed": str(config.seed)}
     if values["params_file"]:
         _check_params(values["params_file"])
+    if values["view"] == PAGE:
+        filled["view_port"] = free_port(values["view_port"])
     if isinstance(config, RunConfig):
         if values.get("num_envs") == "0":
             filled["num_envs"] = str(config.ppo.num_envs)

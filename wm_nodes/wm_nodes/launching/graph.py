@@ -19,7 +19,7 @@ class GraphError(ValueError):
 
 @dataclass(frozen=True)
 class NodeSpec:
-    """One node, whose end ends the graph."""
+    """One node, whose end ends the graph where it is required."""
 
     module: str
     """That `python -m` starts."""
@@ -31,6 +31,8 @@ class NodeSpec:
     """ROS parameters, by name."""
     respawn: bool = False
     """It is started again instead."""
+    required: bool = True
+    """Whether the graph ends with it and waits for it; false: for people who look on."""
     lifecycle: bool = True
     """Ready when active; false: when visible."""
     ranks: int = 1

@@ -11,7 +11,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from wm_msgs.action import Evaluate, Train, TrainVideo
+from wm_msgs.action import Evaluate, Rollout, Train, TrainVideo
 from wm_msgs.msg import RunState
 from wm_nodes.core.errors import RunError
 from wm_nodes.core.types import BoolArray
@@ -29,7 +29,7 @@ class GoalFailed(RunError):
 
 
 class GraphClient:
-    """Client of one graph's `train`, `evaluate` and `video/train` actions; use as a context manager.
+    """Client of one graph's `rollout`, `train`, `evaluate` and `video/train` actions; use as a context manager.
 
     Args:
         namespace: of the graph, e.g. "wm".
@@ -45,6 +45,7 @@ class GraphClient:
         row = topic("run/state")
         self._node.create_subscription(row.type, row.name, self._note_peer, row.reader_qos)
         self._node.create_timer(HEARTBEAT_S, self._peers.check, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._rollout = ActionClient(self._node, Rollout, "rollout")
         self._train = ActionClient(self._node, Train, "train")
         self._evaluate = ActionClient(self._node, Evaluate, "evaluate")
         self._train_video = ActionClient(self._node, TrainVideo, "video/train")
@@ -52,6 +53,15 @@ class GraphClient:
         self._executor.add_node(self._node)
         self._thread = threading.Thread(target=spin, args=(self._executor, self._stop.is_set), daemon=True)
         self._thread.start()
+
+    def rollout(self, steps: int, *, seed: int = 0) -> Rollout.Result:
+        """Let the policy act, with its noise, in so many lock-steps after a reset.
+
+        Raises:
+            GoalFailed: the rollout ended early. PeerLost: no policy node, or it ended meanwhile.
+        """
+        goal = Rollout.Goal(steps=steps, seed=seed, reset=True)
+        return self._run(self._rollout, "policy", goal, lambda message: None)
 
     def evaluate(
         self, *, episodes: int, seed: int, deterministic: bool, label: str, policy_uri: str = "",

@@ -109,6 +109,6 @@ def _action(node: NodeSpec, python: str, environment: dict[str, str]) -> Any:
     return Node(
         executable=python, arguments=node.program(), namespace=node.namespace,
         ros_arguments=["--log-level", node.log_level, *by_node], additional_env=environment, output="screen", **named,
-        **({"on_exit": Shutdown(reason=f"{node.label} ended")} if not node.respawn else {}),
+        **({"on_exit": Shutdown(reason=f"{node.label} ended")} if node.required and not node.respawn else {}),
         **({"respawn": True, "respawn_delay": RESPAWN_S} if node.respawn else {}),
     )

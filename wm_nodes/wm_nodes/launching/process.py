@@ -102,7 +102,8 @@ class NodeProcess:
         self.close()
         code = self.wait(0.0)
         how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
-        return f"required node {self.spec.label} {how}: {self.last_output_line()}"
+        kind = "required node" if self.spec.required else "node"
+        return f"{kind} {self.spec.label} {how}: {self.last_output_line()}"
 
     def last_output_line(self) -> str:
         """The last line written, and where the rest is."""

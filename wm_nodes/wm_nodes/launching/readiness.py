@@ -26,7 +26,7 @@ class NotReadyError(TimeoutError):
 def wait_ready(
     nodes: Sequence[NodeSpec], *, domain: int, timeout_s: float, check: Callable[[], None] = lambda: None
 ) -> None:
-    """Return when all nodes are ready.
+    """Return when all required nodes are ready.
 
     Args:
         check: called at every poll; raises to give up early, e.g. because a process has ended.
@@ -35,7 +35,7 @@ def wait_ready(
         NotReadyError: after timeout_s.
     """
     deadline = time.monotonic() + timeout_s
-    waiting = {node.full_name: node for process in nodes for node in process.carried()}
+    waiting = {node.full_name: node for process in nodes if process.required for node in process.carried()}
     states = dict.fromkeys(waiting, "not seen")
     while waiting:
         with _observer(domain) as (observer, spin_once):

@@ -103,7 +103,7 @@ class Runner:
             raise
 
     def wait_ready(self, timeout_s: float = 60.0) -> None:
-        """Return when every lifecycle node is active and every other node visible.
+        """Return when every required lifecycle node is active and every other required node visible.
 
         Raises:
             NodeDiedError: a required node ended meanwhile.
@@ -144,7 +144,8 @@ class Runner:
         """Exit code (1 to 255) and text of the required node that ended first, or None."""
         ended = [
             process for process in self._processes.values()
-            if process.ended_at is not None and not self._stopping and not _comes_back(process)
+            if process.ended_at is not None and process.spec.required and not self._stopping
+            and not _comes_back(process)
         ]
         if not ended:
             return None

@@ -18,6 +18,8 @@ from wm_nodes.launching.graph import Graph, GraphError, NodeSpec, ParameterValue
 TRUTHS = ("true", "false")
 IMAGINED = ("world_model", "video_model")
 """Environments that a model imagines, which is also where reward `endogenous` comes from."""
+PAGE = "page"
+"""The argument `view` that starts the viewer."""
 REAL = "environment"
 """The environment of environment.factory."""
 ENVIRONMENT_TOPICS = ("env/spec", "env/image", "env/transition", "env/goal", "episode")
@@ -94,6 +96,8 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("memory_limit_gib", "-1", "Data that each node may hold; 0: no limit; -1: an eighth of the memory, "
                    "at least 3, and no limit where the node computes on a GPU"),
     LaunchArgument("compose", "false", "All nodes in one process: fewer copies, one interpreter", TRUTHS),
+    LaunchArgument("view", "", "page: a live page of the graph, which this host alone can open", ("", PAGE)),
+    LaunchArgument("view_port", "0", "Of that page; 0: a free one"),
     LaunchArgument("domain_id", "", "ROS domain, 0 to 101; empty: $ROS_DOMAIN_ID, else 0"),
     LaunchArgument(
         "discovery_range", "LOCALHOST", "Who may find the nodes; beyond this host nothing is authenticated",
@@ -107,6 +111,7 @@ _BY_NAME = {argument.name: argument for argument in ARGUMENTS}
 _COMMON = (
     "preset", "task", "seed", "device", "run_dir", "allowed_dirs", "namespace", "executor", "autostart", "use_sim_time",
     "log_level", "respawn", "memory_limit_gib", "compose", "domain_id", "discovery_range", "python", "params_file",
+    "view", "view_port",
 )
 
 
@@ -144,6 +149,8 @@ def run_folder(scenario: str, given: Mapping[str, str], now: datetime | None = N
 def build_graph(scenario: str, arguments: Mapping[str, str]) -> Graph:
     """Return the graph for resolved arguments, see arguments.begin."""
     graph = scenario_of(scenario).build(arguments)
+    if arguments["view"] == PAGE:
+        graph = dataclasses.replace(graph, nodes=(*graph.nodes, _viewer(arguments)))
     environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": arguments["discovery_range"]}
     if arguments["domain_id"]:
         environment["ROS_DOMAIN_ID"] = str(_integer(arguments, "domain_id", 0, 101))
@@ -196,6 +203,8 @@ def _environment(arguments: Mapping[str, str], backend: str, *, count: str = "nu
         "seed": _integer(arguments, "seed", 0),
         "mode": arguments.get("mode", "lockstep") if not below else "lockstep",
     }
+    if arguments["view"] == PAGE:
+        parameters["view_env"] = 0
     if backend in IMAGINED:
         folder = f"{backend.removeprefix('world_')}_dir"
         if not arguments[folder]:
@@ -210,6 +219,11 @@ def _simulator_and_evaluation(arguments: Mapping[str, str]) -> list[NodeSpec]:
         _environment(arguments, "evaluation", count="simulator_envs", below="sim"),
         _node(arguments, "evaluation", evaluation),
     ]
+
+
+def _viewer(arguments: Mapping[str, str]) -> NodeSpec:
+    node = _node(arguments, "viewer", {"port": _integer(arguments, "view_port", 0, 65535)})
+    return dataclasses.replace(node, required=False, lifecycle=False)
 
 
 def _recorder(arguments: Mapping[str, str], *, simulator: bool = False) -> list[NodeSpec]:
@@ -362,7 +376,7 @@ def describe_arguments(scenario: str) -> str:
             f" One of: {', '.join(choice or '(empty)' for choice in argument.choices)}." if argument.choices else ""
         )
         lines += [f"    {name}:", f"        {argument.help}.{choices} (default: {argument.default!r})"]
-    example, verb = ("grpo.clip_low:=0.1", "train-video-model") if video else ("ppo.num_envs:=8", "train-policy")
+    example, verb = ("grpo.clip:=0.1", "train-video-model") if video else ("ppo.num_envs:=8", "train-policy")
     lines += ["    SECTION.KEY:", f"        Any setting, e.g. {example}; `wm {verb} --help` explains each"]
     return "\n".join(lines)
 

@@ -1,5 +1,5 @@
 """reward_evaluator of loop 2: judges the clips of a rollout buffer against the recordings of their contexts, and by the
-reward agent where its verdict is among the weighed rewards."""
+reward agent or an action world model where they are among the weighed rewards."""
 
 import hashlib
 import sys
@@ -31,10 +31,10 @@ from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.worker import Work
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
-from wm_nodes.video_model.clips import load_clips
+from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import load_video_folder
-from wm_nodes.video_rl.reference_reward import all_scores, load_probe, mix_rewards
-from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.reference_reward import load_probe, mix_rewards
+from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
 
 PARAMS = (
     Param("video_model_dir", "", "Folder of the video model; its codec decodes the clips", read_only=True),
@@ -60,8 +60,8 @@ class ClipEvaluatorNode(ManagedNode):
         folder = load_video_folder(Path(str(self.param("video_model_dir"))), device)
         bags = [Path(text) for text in self.param("context_bags") if text]
         contexts = load_clips(bags, folder.clip["stride"], self._config.clip_steps)
-        self._generator = ClipGenerator(folder, contexts, self._config)
-        self._probe = load_probe(Path(str(self.param("model_dir"))), device)
+        probe = load_probe(Path(str(self.param("model_dir"))), device)
+        self._source = RecordedContexts(folder, contexts, self._config, probe)
         self._fps = clip_fps(bags[0], folder.clip["stride"])
         self._files = named_files(self)
         self._agent = None
@@ -85,22 +85,23 @@ class ClipEvaluatorNode(ManagedNode):
         goal: EvaluateClips.Goal = work.request
         began = time.perf_counter()
         buffer = read_buffer(self._files, goal.buffer_uri, goal.sha256)
-        frames = self._generator.folder.codec.decode(buffer.rollout.latents)
+        request = self._source.request(buffer.iteration, buffer.policy_version)
+        frames = self._source.folder.codec.decode(buffer.rollout.latents)
         verdicts: list[Verdict] = []
         if self._agent is not None:
-            verdicts, result.verdicts = self._judge_clips(self._agent, work, buffer, frames)
-        result.scores = self._score(buffer, frames, verdicts, goal.sha256)
+            references = self._source.references(request)
+            verdicts, result.verdicts = self._judge_clips(self._agent, work, buffer, frames, references)
+        result.scores = self._score(request, buffer, frames, verdicts, goal.sha256)
         work.check()
         result.scores.eval_s = time.perf_counter() - began
         self._scores.publish(result.scores)
         self.diagnostics.latency("evaluate", result.scores.eval_s)
 
     def _judge_clips(
-        self, agent: JudgeServices, work: Work, buffer: RolloutBuffer, frames: torch.Tensor
+        self, agent: JudgeServices, work: Work, buffer: RolloutBuffer, frames: torch.Tensor, references: Clips
     ) -> tuple[list[Verdict], list[ClipVerdict]]:
         """The verdict of every clip, published as it is given; all by one judge and rubric."""
         goal: EvaluateClips.Goal = work.request
-        references = self._generator.references(self._generator.request(buffer.iteration, buffer.policy_version))
         jobs = buffer_jobs(
             frames, references, goal.sha256, self._config, given=self._config.model.num_conditioning, fps=self._fps
         )
@@ -112,13 +113,10 @@ class ClipEvaluatorNode(ManagedNode):
         return verdicts, messages
 
     def _score(
-        self, buffer: RolloutBuffer, frames: torch.Tensor, verdicts: Sequence[Verdict], sha256: str
+        self, request: GroupRequest, buffer: RolloutBuffer, frames: torch.Tensor, verdicts: Sequence[Verdict],
+        sha256: str,
     ) -> ClipScores:
-        request = self._generator.request(buffer.iteration, buffer.policy_version)
-        scores = all_scores(
-            frames, self._generator.references(request), self._probe, self._generator.folder.codec,
-            buffer.condition.num_conditioning, self._config.rewards,
-        )
+        scores = self._source.scores(request, frames, buffer.condition.num_conditioning)
         if self._agent is not None:
             scores |= agent_scores(verdicts)
         total = mix_rewards(scores, self._config.rewards)

@@ -113,7 +113,7 @@ class LearnerNode(TrainingNode):
         self.serve_training(self._training, Train, "train", "policy/version")
 
     def activate(self) -> None:
-        self.announce_versions()
+        self.announce()
         if self.param("replay_at_start"):
             self._train_from_replay(str(self.param("replay_at_start")))
 

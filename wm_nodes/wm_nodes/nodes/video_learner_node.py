@@ -2,10 +2,7 @@
 
 import math
 import sys
-import threading
-from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +20,14 @@ from wm_nodes.ros.actions import GuardedActionClient
 from wm_nodes.ros.clients import run_goal, same_process
 from wm_nodes.ros.endpoint_matching import StartBarrier
 from wm_nodes.ros.params import COMMON, Param, named_files
-from wm_nodes.ros.wire import Cancelled, PeerLost
+from wm_nodes.ros.wire import PeerLost
 from wm_nodes.ros.worker import Work
 from wm_nodes.training.ranks import Ranks, own_device
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import BufferReport
 from wm_nodes.video_rl.reference_reward import attach_rewards
-from wm_nodes.video_rl.train import post_train
+from wm_nodes.video_rl.train import post_train, sample_buffers
 from wm_nodes.video_rl.training_run import VideoRun
 from wm_nodes.video_rl.validation import alarm_text, validation_scores
 
@@ -63,26 +60,21 @@ class VideoLearnerNode(TrainingNode):
         values = {param.name: self.param(param.name) for param in (*COMMON, *PARAMS)}
         self._video = make_run(values, self.run_dir, self.ranks)
         self.own(self._video.close)
-        self._watched, self._files = self._video.hacked, named_files(self)
+        self._watched, self.files = self._video.hacked, named_files(self)
         self._start_barrier = StartBarrier(self, self.links.table)
-        self._generate = GuardedActionClient(self, GenerateClips, "video/generate")
-        self._evaluate = GuardedActionClient(self, EvaluateClips, "clips/evaluate")
-        self.own(self._generate.destroy)
-        self.own(self._evaluate.destroy)
+        self.generate = GuardedActionClient(self, GenerateClips, "video/generate")
+        self.evaluate = GuardedActionClient(self, EvaluateClips, "clips/evaluate")
+        self.own(self.generate.destroy)
+        self.own(self.evaluate.destroy)
         self.serve_training(self._video, TrainVideo, "video/train", "video/version")
 
     def activate(self) -> None:
-        self.announce_versions()
-
-    def announce_versions(self) -> None:
-        for version in sorted({self._video.sampling_version, self._video.version}):
-            self.announce(version)
+        self.announce()
 
     def update_diagnostics(self) -> None:
         if hasattr(self, "_video"):
             self.diagnostics.gauge("version", self._video.version)
             self.diagnostics.gauge("iterations", self._video.iterations)
-            self.diagnostics.gauge("staleness", self._video.staleness)
 
     # Training, in a worker thread.
 
@@ -91,81 +83,24 @@ class VideoLearnerNode(TrainingNode):
         count = len(goal.from_buffers) or int(goal.iterations)
         if not count:
             raise ValueError("iterations is 0 and from_buffers is empty; ask for at least 1")
+        buffers: Iterable[RolloutBuffer]
         if goal.from_buffers:
-            source = self._read_buffers(goal.from_buffers)
+            buffers = (read_buffer(self.files, uri, "") for uri in goal.from_buffers)
         else:
             self._start_barrier.wait(work)
-            source = self._sample_buffers(work, count)
+            buffers = sample_buffers(GraphClips(self, work), self._video, count)
         self._video.check = work.check
-        with closing(source) as buffers:
-            for done, (_, report) in enumerate(post_train(self._video, map(self._count_invalid, buffers)), 1):
-                if report.skipped:
-                    self.diagnostics.count("skipped_buffers", text="no group of a buffer has rewards that differ")
-                self.announce()
-                self._send_feedback(work, report, done, count)
-                self._warn_of_hacking()
+        for done, (_, report) in enumerate(post_train(self._video, map(self._count_invalid, buffers)), 1):
+            if report.skipped:
+                self.diagnostics.count("skipped_buffers", text="no group of a buffer has rewards that differ")
+            self.announce()
+            self._send_feedback(work, report, done, count)
+            self._warn_of_hacking()
 
     def _count_invalid(self, buffer: RolloutBuffer) -> RolloutBuffer:
         if invalid := len(buffer) - int(buffer.valid.sum()):
             self.diagnostics.count("invalid_rewards", invalid, text=f"{invalid} clips without reward")
         return buffer
-
-    def _read_buffers(self, uris: Sequence[str]) -> Generator[RolloutBuffer]:
-        for uri in uris:
-            yield read_buffer(self._files, uri, "")
-
-    def _sample_buffers(self, work: Work, count: int) -> Generator[RolloutBuffer]:
-        """`count` buffers of fresh clips with their rewards, each to be trained on before the next one is taken.
-
-        Where the settings allow the staleness, the next one is being made meanwhile; there is never more than one under
-        way. Closed early, this leaves none.
-        """
-        run, closed = self._video, threading.Event()
-        ahead: Future[RolloutBuffer] | None = None
-
-        def check() -> None:
-            work.check()
-            if closed.is_set():
-                raise Cancelled("the training that this was for has ended")
-
-        with ThreadPoolExecutor(1, "prefetch") as thread:
-            try:
-                for left in reversed(range(count)):
-                    buffer = ahead.result() if ahead else self._sample(run.iterations, run.sampling_version, check)
-                    if left and run.prefetches:
-                        ahead = thread.submit(self._sample, run.iterations + 1, run.version, check)
-                    yield buffer
-            finally:
-                closed.set()
-
-    def _sample(self, iteration: int, version: int, check: Callable[[], None]) -> RolloutBuffer:
-        """The buffer of an iteration, sampled by a version, with its rewards."""
-        goal = GenerateClips.Goal(iteration=iteration, policy_version=version)
-        clips = self._ask(self._generate, goal, check, "/video_model")
-        request = EvaluateClips.Goal(
-            buffer_uri=clips.buffer_uri, sha256=clips.sha256, deadline_s=float(self.param("round_deadline_s"))
-        )
-        judged = self._ask(self._evaluate, request, check, "/reward_evaluator")
-        if judged.scores.pause_reason:
-            raise TrainingPaused(
-                f"training pauses before iteration {iteration}: {judged.scores.pause_reason}. Nothing was trained on "
-                f"these clips ({clips.buffer_uri}); mend the judge and train again: the same clips are then judged"
-            )
-        return with_scores(read_buffer(self._files, clips.buffer_uri, clips.sha256), judged.scores)
-
-    def _ask(self, client: GuardedActionClient, goal: Any, check: Callable[[], None], peer: str) -> Any:
-        """Raises PeerLost where nobody answers, ValueError where the peer says that it failed."""
-        name = self.get_namespace().rstrip("/") + peer
-        alive = same_process(self.peers, name)
-        try:
-            result = run_goal(client, goal, accept_s=float(self.param("accept_timeout_s")), check=check, alive=alive)
-        except PeerLost as error:
-            raise PeerLost(str(error) if name in str(error) else f"{name}: {error}") from None
-        if result.termination_reason == type(result).DEACTIVATED:
-            raise PeerLost(f"{name} was stopped: {result.message}")
-        if result.termination_reason != type(result).FINISHED:
-            raise ValueError(f"{name}: {result.message or f'ended with reason {result.termination_reason}'}")
-        return result
 
     def _send_feedback(self, work: Work, report: BufferReport, done: int, count: int) -> None:
         work.feedback(
@@ -191,6 +126,55 @@ class VideoLearnerNode(TrainingNode):
     def fill(self, result: TrainVideo.Result) -> TrainVideo.Result:
         result.policy_version, result.iterations = self._video.version, self._video.iterations
         result.checkpoint_uri = self._video.checkpoint
+        return result
+
+
+class GraphClips:
+    """Clips of the graph as a source of post-training (video_rl.train.ClipSource): the video model's node samples them,
+    the reward evaluator's scores them.
+
+    Args:
+        work: what the clips are for; its end ends a call.
+    """
+
+    def __init__(self, node: VideoLearnerNode, work: Work) -> None:
+        self._node, self._work = node, work
+        self._clips: Any = None
+
+    def request(self, iteration: int, policy_version: int) -> GenerateClips.Goal:
+        return GenerateClips.Goal(iteration=iteration, policy_version=policy_version)
+
+    def sample(self, request: GenerateClips.Goal) -> RolloutBuffer:
+        self._clips = self._ask(self._node.generate, request, "/video_model")
+        return read_buffer(self._node.files, self._clips.buffer_uri, self._clips.sha256)
+
+    def score(self, request: GenerateClips.Goal, clips: RolloutBuffer) -> RolloutBuffer:
+        """Raises TrainingPaused where the evaluator asks for it."""
+        goal = EvaluateClips.Goal(
+            buffer_uri=self._clips.buffer_uri, sha256=self._clips.sha256,
+            deadline_s=float(self._node.param("round_deadline_s")),
+        )
+        scores = self._ask(self._node.evaluate, goal, "/reward_evaluator").scores
+        if scores.pause_reason:
+            raise TrainingPaused(
+                f"training pauses before iteration {request.iteration}: {scores.pause_reason}. Nothing was trained on "
+                f"these clips ({self._clips.buffer_uri}); mend the judge and train again: the same clips are then "
+                "judged"
+            )
+        return with_scores(clips, scores)
+
+    def _ask(self, client: GuardedActionClient, goal: Any, peer: str) -> Any:
+        """Raises PeerLost where nobody answers, ValueError where the peer says that it failed."""
+        node, name = self._node, self._node.get_namespace().rstrip("/") + peer
+        accept_s, alive = float(node.param("accept_timeout_s")), same_process(node.peers, name)
+        try:
+            result = run_goal(client, goal, accept_s=accept_s, check=self._work.check, alive=alive)
+        except PeerLost as error:
+            raise PeerLost(str(error) if name in str(error) else f"{name}: {error}") from None
+        if result.termination_reason == type(result).DEACTIVATED:
+            raise PeerLost(f"{name} was stopped: {result.message}")
+        if result.termination_reason != type(result).FINISHED:
+            raise ValueError(f"{name}: {result.message or f'ended with reason {result.termination_reason}'}")
         return result
 
 

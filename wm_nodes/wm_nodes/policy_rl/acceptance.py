@@ -47,7 +47,7 @@ def accept_model(
     if video_model_dir is not None:
         return accept_video_model(config, imagined, real, clone)
     models = models_of(model_dir, config.device)
-    return accept_world_model(models, load_arrays(bags, config), config, imagined, real, clone)
+    return accept_world_model(models, load_arrays(bags, config, models.tasks), config, imagined, real, clone)
 
 
 def acceptance_when_made(model_dir: Path | None, config: RunConfig) -> str:

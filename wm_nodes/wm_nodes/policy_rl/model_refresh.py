@@ -26,7 +26,7 @@ from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.recording import read_episodes
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model import ActionModel, WorldModels, load_model_folder, save_refreshed_folder
-from wm_nodes.world_model.folder import read_world_manifest
+from wm_nodes.world_model.folder import model_spec, read_world_manifest
 from wm_nodes.world_model.positions import judged_things
 from wm_nodes.world_model.training.dynamics import train_action_model
 from wm_nodes.world_model.validation.open_loop import episode_errors
@@ -85,12 +85,17 @@ class RefreshDecision:
 
 
 def check_refreshable(model_dir: Path) -> None:
-    """Raise ValueError for a model whose tokens are quantised: only the continuous action model can be refreshed."""
-    kind = read_world_manifest(model_dir)["tokenizer"]["kind"]
+    """Raise ValueError for a model that cannot be refreshed: only a continuous action model with positions can."""
+    manifest = read_world_manifest(model_dir)
+    kind = manifest["tokenizer"]["kind"]
     if kind != "continuous":
         raise ValueError(
             f"{model_dir} has tokenizer.kind {kind}; rounds refresh continuous models only: set num_rounds to 1, or "
             "take a model made with tokenizer.kind=continuous"
+        )
+    if not model_spec(model_dir, manifest).ground_truth_names:
+        raise ValueError(
+            f"{model_dir} was trained without ground truth, and rounds compare models by positions: set num_rounds to 1"
         )
 
 

@@ -14,6 +14,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
+from wm_nodes.config.load import ConfigError
 from wm_nodes.config.scenes import splits
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT, MODEL_EPISODES, WEAK_POLICIES, seed_spans
@@ -57,10 +58,10 @@ FEW_STEPS = 16
 """Of one iteration of the action model: where recorded episodes are longer, their user hears of parts."""
 
 
-def load_arrays(bags: Iterable[Path], config: RunConfig) -> EpisodeArrays:
-    """Stack every episode of the bags, labelled for all tasks of the scene."""
+def load_arrays(bags: Iterable[Path], config: RunConfig, tasks: Sequence[str] = ()) -> EpisodeArrays:
+    """Stack every episode of the bags, labelled for `tasks`, or all tasks of the scene."""
     episodes = (episode for bag in bags for episode in read_episodes(bag))
-    return stack_episodes(episodes, model_tasks(config.task), num_steps=config.simulation.max_episode_steps)
+    return stack_episodes(episodes, tasks or model_tasks(config.task), num_steps=config.simulation.max_episode_steps)
 
 
 def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
@@ -71,7 +72,11 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
     Raises:
         DeviceError: there is no such device, which is found out first, or its memory is too small.
         ModelFolderError, MissingPackageError: world_model.text_encoder cannot be loaded, found out before collecting.
+        ConfigError: data.ground_truth is false.
     """
+    if not config.data.ground_truth:
+        raise ConfigError("data.ground_truth is false, and a world model that collects its own episodes learns from "
+                          "it; collect with wm collect and train with wm train-model")
     folder = run_dir / "model"
     if (folder / MANIFEST).exists():
         return folder
@@ -142,7 +147,7 @@ def read_recordings(bags: Sequence[Path], config: RunConfig, task: str = "") -> 
         BagError: as read_training_data. ValueError: tokenizer.patch_px does not fit the pictures.
     """
     data, episodes = read_training_data(
-        bags, num_heldout=config.data.num_heldout, seed=config.seed, task=task,
+        bags, num_heldout=config.data.num_heldout, seed=config.seed, task=task, ground_truth=config.data.ground_truth,
         check=lambda spec: Tokenizer(config.tokenizer, spec.height, spec.width, 0),
     )
     return data, episode_starts(episodes[:MAX_STARTS], frames=config.data.start_frames, seed=config.seed)

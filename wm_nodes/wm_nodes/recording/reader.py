@@ -16,9 +16,6 @@ from wm_nodes.recording.errors import BagError
 from wm_nodes.recording.join import MAX_LAG, LockSteps
 from wm_nodes.recording.messages import KIND_END
 
-EPISODE_FIELDS = (*POLICY_FIELDS, "ground_truth_names")
-"""What training a world model depends on."""
-
 
 @dataclass
 class BagReport:
@@ -94,7 +91,7 @@ def read_episodes(
 
 
 def check_spec(
-    recorded: EnvironmentSpec, expected: EnvironmentSpec, *, where: str, names: Sequence[str] = EPISODE_FIELDS
+    recorded: EnvironmentSpec, expected: EnvironmentSpec, *, where: str, names: Sequence[str] = POLICY_FIELDS
 ) -> None:
     """Raise BagError unless both agree on the named fields, see core.specs.agree."""
     try:

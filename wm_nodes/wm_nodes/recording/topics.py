@@ -38,9 +38,6 @@ POLICY = _qos(depth=1, latched=True, lease_s=POLICY_LEASE_S)
 GOALS = _qos(depth=CREDIT_WINDOW + 2, latched=True)
 """Latched, but deep: an evaluator that lags by a full credit window still gets the goals of every episode."""
 
-VERSIONS = _qos(depth=2, latched=True)
-"""Latched, with the version before: a video model that joins late may be asked for it by a learner that prefetches."""
-
 VERDICTS = _qos(depth=512, latched=True)
 """Latched and deep: who joins late sees the last round's verdicts, and a reader loses none of a round of 256 clips."""
 
@@ -82,7 +79,7 @@ CLIPS = RecordedTopic("clips", "wm_msgs/msg/ClipBatch", METRICS)
 CLIP_IMAGES = RecordedTopic("clips/image", "sensor_msgs/msg/Image", METRICS, sequenced=False)
 CLIP_SCORES = RecordedTopic("clips/scores", "wm_msgs/msg/ClipScores", METRICS)
 VERDICT = RecordedTopic("reward/verdict", "wm_msgs/msg/ClipVerdict", VERDICTS)
-VIDEO_VERSION = RecordedTopic("video/version", "wm_msgs/msg/PolicyVersion", VERSIONS)
+VIDEO_VERSION = RecordedTopic("video/version", "wm_msgs/msg/PolicyVersion", LATCHED)
 
 VIDEO_TOPICS = (CLIPS, CLIP_IMAGES, CLIP_SCORES, VIDEO_VERSION, VERDICT, RUN_STATE)
 """Loop 2: clips come every few seconds, asked for one buffer at a time, so a depth of ten holds every unread one."""

@@ -44,7 +44,7 @@ class TrainingData:
 
 
 def read_training_data(
-    bags: Sequence[Path], *, num_heldout: int, seed: int, task: str = "",
+    bags: Sequence[Path], *, num_heldout: int, seed: int, task: str = "", ground_truth: bool = True,
     check: Callable[[EnvironmentSpec], object] = lambda spec: None,
 ) -> tuple[TrainingData, list[Episode]]:
     """Read the complete episodes of bags and hold a share of those that succeed, and of those that do not, back.
@@ -52,6 +52,7 @@ def read_training_data(
     Args:
         num_heldout: most episodes to hold out; at most a quarter is, and at least one of each kind.
         task: that the bags must be of; empty: any.
+        ground_truth: False: as if none had been recorded.
         check: raises for a spec that is no use, before an episode is read.
 
     Returns:
@@ -61,8 +62,11 @@ def read_training_data(
         BagError: bags of different cameras, sizes, actions, states or tasks, of another task, without actions, without
             any success, or with too few episodes.
     """
-    spec = _common_spec(bags, task, check)
+    recorded = spec = _common_spec(bags, task, check)
     episodes, lost = _read(bags, spec)
+    if not ground_truth:
+        spec = replace(spec, ground_truth_names=())
+        episodes = [replace(episode, ground_truth=episode.ground_truth[:, :0]) for episode in episodes]
     named = ", ".join(map(str, bags))
     if len(episodes) < MIN_EPISODES:
         more = "".join(f"; {line}" for line in lost)
@@ -87,7 +91,8 @@ def read_training_data(
         for is_held in (False, True)
     )
     chosen = [episode for episode, its in zip(episodes, held) if not its]
-    summary = *_used(spec, episodes, parts, won, held), *lost
+    withheld = ["the recorded ground truth is not used (data.ground_truth)"] if recorded != spec else []
+    summary = *_used(spec, episodes, parts, won, held), *withheld, *lost
     return TrainingData(spec, tasks, training, heldout, len(chosen), summary), chosen
 
 

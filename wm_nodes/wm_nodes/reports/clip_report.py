@@ -15,6 +15,7 @@ TITLES = {
     "tracking": "tracking score", "object_cm": "object error, cm", "tool_cm": "tool error, cm", "psnr_db": "PSNR, dB",
     "scenery": "scenery error", "motion": "motion share", "success": "task done at the end", "outcome": "outcome score",
     "ssim": "SSIM", "perceptual": "perceptual score", "closeness": "closeness of pictures",
+    "execution": "done signal of the action world model", "execution_success": "task done in the action world model",
 }
 """Score to its name for people, in the order of the tables; see docs/metrics.md."""
 UNREWARDED_TITLES = {
@@ -59,8 +60,6 @@ class ClipSummary:
     """Buffers trained on."""
     version: int
     """Optimizer steps."""
-    weights: str
-    """Which ones were measured after: averaged or last."""
     contexts: int
     """Held-out ones behind each score."""
     scores: Mapping[str, ScoreChange]
@@ -119,7 +118,7 @@ def hacking_text(summary: ClipSummary) -> str:
 
 def scores_table(summary: ClipSummary) -> Table:
     """The table for the terminal."""
-    title = f"held-out contexts (n = {summary.contexts}), one ODE clip each, {summary.weights} weights"
+    title = f"held-out contexts (n = {summary.contexts}), one ODE clip each"
     columns = ("score", "before", "after", "difference, 95 % bootstrap interval", "")
     marks = {"better": "[green]better[/]", "worse": "[red]worse[/]"}
     rows = ((name, *cells, marks.get(verdict, "")) for name, verdict, cells in _rows(summary))

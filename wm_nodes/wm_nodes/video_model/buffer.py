@@ -5,9 +5,8 @@ Shapes: N videos, S stochastic steps. The file is one safetensors; nothing in it
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from safetensors import SafetensorError
@@ -17,20 +16,19 @@ from torch import Tensor
 from wm_nodes.config.video import RolloutConfig
 from wm_nodes.training.checkpoint import metadata_of
 from wm_nodes.video_model.conditions import Condition
-from wm_nodes.video_model.sampling import VideoRollout
+from wm_nodes.video_model.sampling import ROWS, VideoRollout
 
 _METADATA_KEY = "rollout_buffer"
-_ROWS = ("latents", "states", "mask", "sigma_base", "zeta", "seeds")
-_ROLLOUT_TENSORS = (*_ROWS, "noise_share", "times")
+_ROLLOUT_TENSORS = (*ROWS, "noise_share")
 
 
 class RolloutBufferError(ValueError):
-    """A buffer that is damaged, stale, or was made with other sampler settings."""
+    """A buffer that is damaged, of other weights, or was made with other sampler settings."""
 
 
 def config_hash(settings: RolloutConfig) -> str:
     """Return the sha256 of what decides the Gaussian of a transition; storage_dtype does, since it rounds states."""
-    knobs = settings.model_dump(exclude={"micro_batch", "noise_store", "buffer_device"})
+    knobs = settings.model_dump(exclude={"micro_batch", "buffer_device"})
     return hashlib.sha256(json.dumps(knobs, sort_keys=True).encode()).hexdigest()
 
 
@@ -51,8 +49,6 @@ class RolloutBuffer:
     """Place in the group, int64 (N,)."""
     rewards: Mapping[str, Tensor]
     """Raw values by name, float64 (N,), NaN where missing."""
-    valid: Tensor
-    """bool (N,), False where any reward is missing or was refused."""
     policy_version: int
     """Optimizer steps of the weights that sampled."""
     iteration: int
@@ -64,15 +60,25 @@ class RolloutBuffer:
         return len(self.group_ids)
 
     @property
-    def num_bytes(self) -> int:
-        return sum(tensor.nbytes for tensor in self._tensors().values())
+    def reward(self) -> Tensor:
+        """The reward that trains, float64 (N,): `total`, or the only one. Raises ValueError: there is neither."""
+        if "total" not in self.rewards and len(self.rewards) != 1:
+            raise ValueError(
+                f"the buffer holds rewards {', '.join(self.rewards) or '(none)'} and no `total`; mix them first"
+            )
+        return self.rewards["total"] if "total" in self.rewards else next(iter(self.rewards.values()))
+
+    @property
+    def valid(self) -> Tensor:
+        """bool (N,), which videos have a reward that trains."""
+        return torch.isfinite(self.reward)
 
     def to(self, device: torch.device | str) -> "RolloutBuffer":
         """The same buffer with its videos and condition on a device."""
         return replace(self, rollout=self.rollout.to(device), condition=self.condition.to(device))
 
     def with_rewards(self, rewards: Mapping[str, Tensor]) -> "RolloutBuffer":
-        """The same videos with rewards, from any device; a video is valid while all of its rewards are finite.
+        """The same videos with rewards, from any device.
 
         Raises:
             RolloutBufferError: a reward is not one number per video.
@@ -81,31 +87,25 @@ class RolloutBuffer:
         for name, value in values.items():
             if value.shape != (len(self),):
                 raise RolloutBufferError(f"reward {name} has shape {tuple(value.shape)}, the buffer {len(self)} videos")
-        valid = torch.ones(len(self), dtype=torch.bool)
-        for value in values.values():
-            valid &= torch.isfinite(value)
-        return replace(self, rewards=values, valid=valid)
+        return replace(self, rewards=values)
 
-    def check(self, settings: RolloutConfig, policy_version: int, max_staleness: int) -> None:
-        """Raise RolloutBufferError if the buffer was sampled with other settings, or by weights that are too old."""
+    def check(self, settings: RolloutConfig, policy_version: int) -> None:
+        """Raise RolloutBufferError if the buffer was sampled with other settings, or by other weights."""
         wanted = config_hash(settings)
         if self.config_hash != wanted:
             raise RolloutBufferError(
                 f"the buffer was sampled with sampler settings {self.config_hash[:12]}, the learner has {wanted[:12]}: "
                 f"its ratios would be wrong; sample again, or load the settings of that run"
             )
-        staleness = policy_version - self.policy_version
-        if not 0 <= staleness <= max_staleness:
+        if policy_version != self.policy_version:
             raise RolloutBufferError(
-                f"the buffer comes from version {self.policy_version}, the learner is at {policy_version}: staleness "
-                f"{staleness} is outside 0 to {max_staleness}; sample again, or raise grpo.max_staleness"
+                f"the buffer comes from version {self.policy_version}, the learner is at {policy_version}; sample again"
             )
 
     def to_bytes(self) -> bytes:
         """One safetensors file; from_bytes gives an equal buffer."""
         header = {
             "steps": self.rollout.steps,
-            "state_steps": self.rollout.state_steps,
             "policy_version": self.policy_version,
             "iteration": self.iteration,
             "config_hash": self.config_hash,
@@ -128,18 +128,17 @@ class RolloutBuffer:
             header = json.loads(metadata_of(data)[_METADATA_KEY])
             rollout = {name: tensors[f"rollout.{name}"] for name in _ROLLOUT_TENSORS}
             for name, values in tensors.items():
-                if name.startswith("condition.") or name.removeprefix("rollout.") in _ROWS:
+                if name.startswith("condition.") or name.removeprefix("rollout.") in ROWS:
                     _check_finite(name, values)
             rewards = sorted(name for name in tensors if name.startswith("reward."))
             return cls(
-                rollout=VideoRollout(**rollout, steps=tuple(header["steps"]), state_steps=tuple(header["state_steps"])),
+                rollout=VideoRollout(**rollout, steps=tuple(header["steps"])),
                 condition=Condition(
                     tensors["condition.frames"], tensors["condition.actions"], tensors["condition.text"]
                 ),
                 group_ids=tensors["group_ids"],
                 sample_ids=tensors["sample_ids"],
                 rewards={name.removeprefix("reward."): tensors[name] for name in rewards},
-                valid=tensors["valid"],
                 policy_version=header["policy_version"],
                 iteration=header["iteration"],
                 config_hash=header["config_hash"],
@@ -153,7 +152,7 @@ class RolloutBuffer:
         tensors = {f"rollout.{name}": getattr(self.rollout, name) for name in _ROLLOUT_TENSORS}
         tensors |= {f"condition.{name}": getattr(self.condition, name) for name in ("frames", "actions", "text")}
         tensors |= {f"reward.{name}": value for name, value in self.rewards.items()}
-        tensors |= {"group_ids": self.group_ids, "sample_ids": self.sample_ids, "valid": self.valid}
+        tensors |= {"group_ids": self.group_ids, "sample_ids": self.sample_ids}
         return {name: tensor.contiguous() for name, tensor in tensors.items()}
 
 
@@ -164,38 +163,3 @@ def _check_finite(name: str, values: Tensor) -> None:
             f"video {video} of the buffer has a value in {name} that is no number; lower the learning rate, or begin "
             "with other weights"
         )
-
-
-def concatenate_buffers(parts: Sequence[RolloutBuffer]) -> RolloutBuffer:
-    """Return one buffer of the groups of all parts, which must agree on settings, version, iteration and steps.
-
-    Raises:
-        RolloutBufferError: they do not, or a group is in two parts.
-    """
-    first, groups = parts[0], [set(part.group_ids.tolist()) for part in parts]
-    of = [(part.config_hash[:12], part.policy_version, part.iteration, part.rollout.steps) for part in parts]
-    if different := [other for other in of if other != of[0]]:
-        raise RolloutBufferError(
-            f"buffers of (settings, version, iteration, steps) {of[0]} and {different[0]} do not belong together; "
-            "sample all parts by the same weights and settings"
-        )
-    if sum(map(len, groups)) != len(set.union(*groups)):
-        raise RolloutBufferError("a group is in two parts of a buffer; give each context its own group id")
-    rollouts, conditions = [part.rollout for part in parts], [part.condition for part in parts]
-    shares = torch.tensor([len(part) for part in parts]) / sum(map(len, parts))
-    squares = torch.stack([rollout.noise_share.cpu().square() for rollout in rollouts])
-    noise_share = (shares.unsqueeze(1) * squares).sum(0).sqrt()
-    rows: dict[str, Any] = {name: _cat(rollouts, name) for name in _ROWS}
-    return replace(
-        first,
-        rollout=replace(first.rollout, noise_share=noise_share, **rows),
-        condition=Condition(*(_cat(conditions, name) for name in ("frames", "actions", "text"))),
-        group_ids=torch.cat([part.group_ids for part in parts]),
-        sample_ids=torch.cat([part.sample_ids for part in parts]),
-        rewards={name: torch.cat([part.rewards[name] for part in parts]) for name in first.rewards},
-        valid=torch.cat([part.valid for part in parts]),
-    )
-
-
-def _cat(parts: Sequence[Any], name: str) -> Tensor:
-    return torch.cat([getattr(part, name) for part in parts])

@@ -1,6 +1,6 @@
 """Recorded episodes as clips of latents.
 
-Shapes: E episodes, F frames, H W 3 image, C h w latents, A action, P simulator state.
+Shapes: E episodes, F frames, H W 3 image, C h w latents, A action, S state, P simulator state.
 """
 
 from collections.abc import Sequence
@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.tasks import get_task
+from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Episode, FloatArray
-from wm_nodes.recording import read_episodes
+from wm_nodes.recording import read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.video_model import Condition
 from wm_nodes.video_model.conditions import hashed_words
@@ -36,6 +37,10 @@ class Clips:
     """Of all of them."""
     seeds: tuple[int, ...] = ()
     """Of the simulator's reset, one each; () where unknown."""
+    states: FloatArray | None = None
+    """(E, F, S) of the tool; None where unknown."""
+    spec: EnvironmentSpec | None = None
+    """Of the environment that was recorded; None where unknown."""
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -45,7 +50,14 @@ class Clips:
             self.frames[index], self.actions[index], self.ground_truth[index.numpy()],
             tuple(self.instructions[int(i)] for i in index), self.task,
             tuple(self.seeds[int(i)] for i in index) if self.seeds else (),
+            None if self.states is None else self.states[index.numpy()], self.spec,
         )
+
+    def first_states(self) -> FloatArray:
+        """The states (E, S) that the clips begin with. Raises ValueError where they are unknown."""
+        if self.states is None:
+            raise ValueError("these clips have no states of the tool; load them from bags")
+        return np.ascontiguousarray(self.states[:, 0])
 
     def window(self, first: int, frames: int) -> "Clips":
         """The frames from `first` on.
@@ -59,6 +71,7 @@ class Clips:
         return replace(
             self, frames=self.frames[:, first:last], actions=self.actions[:, first : last - 1],
             ground_truth=self.ground_truth[:, first:last],
+            states=None if self.states is None else self.states[:, first:last],
         )
 
     def condition(self, codec: Codec, num_conditioning: int, text_dim: int) -> Condition:
@@ -87,7 +100,8 @@ def load_clips(bags: Sequence[Path], stride: int, steps: int = 0) -> Clips:
     if lengths and not episodes:
         raise ValueError(f"no episode has {steps} steps, the longest {max(lengths)}; lower clip_steps")
     tasks = [episode.task for episode in episodes[:1]]
-    return cut_clips(stack_episodes(episodes, tasks, num_steps=steps or None), stride)
+    clips = cut_clips(stack_episodes(episodes, tasks, num_steps=steps or None), stride)
+    return replace(clips, spec=read_spec(bags[0]))
 
 
 def checked(episode: Episode, bag: Path) -> Episode:
@@ -132,4 +146,5 @@ def cut_clips(episodes: EpisodeArrays, stride: int) -> Clips:
         frames=torch.from_numpy(np.ascontiguousarray(episodes.images[:, ::stride])),
         actions=torch.from_numpy(np.ascontiguousarray(actions)), ground_truth=episodes.ground_truth[:, ::stride],
         instructions=episodes.instructions, task=episodes.tasks[0], seeds=episodes.seeds,
+        states=episodes.states[:, ::stride],
     )

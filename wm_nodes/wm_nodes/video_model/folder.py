@@ -87,7 +87,7 @@ def load_video_folder(folder: Path, device: torch.device | str = "cpu") -> Video
     """
     manifest = read_video_manifest(folder)
     network = VideoNetwork(NetworkSettings(**manifest["network"]))
-    _load(Path(folder) / NETWORK, network, manifest["sha256"][NETWORK])
+    load_module(Path(folder) / NETWORK, network, manifest["sha256"][NETWORK])
     codec = _load_codec(Path(folder), manifest["sha256"][CODEC], **manifest["codec"])
     return VideoFolder(codec.to(device), network.to(device), manifest["clip"], manifest)
 
@@ -101,11 +101,12 @@ def _load_codec(folder: Path, sha256: str, kind: str, **settings: Any) -> Codec:
     if kind == "tokenizer":
         settings["config"] = TokenizerConfig.model_validate(settings["config"])
     codec: Codec = PatchCodec(**settings) if kind == "patch" else TokenizerCodec(**settings)
-    _load(folder / CODEC, codec, sha256)
+    load_module(folder / CODEC, codec, sha256)
     return codec
 
 
-def _load(path: Path, module: nn.Module, sha256: str) -> None:
+def load_module(path: Path, module: nn.Module, sha256: str) -> None:
+    """Load and verify the weights of a part, in evaluation mode. Raises ModelFolderError."""
     try:
         load_weights(module, read_model_file(path, sha256))
     except WeightsError as error:

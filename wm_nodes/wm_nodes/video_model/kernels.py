@@ -46,12 +46,8 @@ class Step(NamedTuple):
     """Like x."""
     std: Tensor
     """(B, 1, F, H, W), 0 on conditioning frames."""
-    sigma_base: Tensor
-    """(B,), the std where the mask is 1."""
     mask: Tensor
     """(B, 1, F, H, W), 0 on conditioning frames."""
-    slope: Tensor
-    """d mean / d v of each element, (B, 1, F, H, W) or (B, 1, 1, 1, 1)."""
 
 
 Kernel = Callable[[Tensor, Tensor, Tensor, Tensor, StepContext, SamplerConfig], Step]
@@ -76,13 +72,12 @@ def with_conditioning(x: Tensor, conditioning: Tensor) -> Tensor:
 def ode_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerConfig) -> Step:
     """The Euler step x + (s - t) v."""
     still = _generated(x, context)
-    slope = _rows(s - t, x)
-    return Step(x + slope * v, torch.zeros_like(still), torch.zeros_like(slope).flatten(), still, slope)
+    return Step(x + _rows(s - t, x) * v, torch.zeros_like(still), still)
 
 
 def cps_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerConfig) -> Step:
     """Coefficient-preserving sampling: DD-4 with the same sigma in every cell."""
-    return _preserving_step(*estimates(x, v, t), t, s, _generated(x, context), settings)
+    return _preserving_step(*estimates(x, v, t), s, _generated(x, context), settings)
 
 
 def dyndiff_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerConfig) -> Step:
@@ -94,7 +89,7 @@ def dyndiff_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContex
     elif mask.shape != (x.shape[0], 1, *x.shape[2:]):
         expected = (x.shape[0], 1, *x.shape[2:])
         raise ValueError(f"mask must be {expected} for latents {tuple(x.shape)}, got {tuple(mask.shape)}")
-    return _preserving_step(x0, eps, t, s, mask.to(x.dtype), settings)
+    return _preserving_step(x0, eps, s, mask.to(x.dtype), settings)
 
 
 @torch.no_grad()
@@ -104,18 +99,17 @@ def rollout_mask(x0: Tensor, context: StepContext, settings: SamplerConfig) -> T
     return mask.to(x0.dtype)
 
 
-def _preserving_step(x0: Tensor, eps: Tensor, t: Tensor, s: Tensor, mask: Tensor, settings: SamplerConfig) -> Step:
+def _preserving_step(x0: Tensor, eps: Tensor, s: Tensor, mask: Tensor, settings: SamplerConfig) -> Step:
     """DD-10, DD-11: mean (1 - s) x0 + sqrt(s^2 - sigma^2) eps; the squared noise coefficients add up to s^2."""
     with torch.no_grad():
-        base, sigma = _rows(_sigma_base(s, settings.eta), x0), masked_deviation(mask, s, settings)
+        sigma = masked_deviation(mask, s, settings)
         kept = (_rows(s, x0).square() - sigma.square()).clamp_min(0).sqrt()
-        slope = _rows(1 - t, x0) * kept - _rows((1 - s) * t, x0)
-    return Step(_rows(1 - s, x0) * x0 + kept * eps, sigma, base.flatten(), mask, slope)
+    return Step(_rows(1 - s, x0) * x0 + kept * eps, sigma, mask)
 
 
 def masked_deviation(mask: Tensor, s: Tensor, settings: SamplerConfig) -> Tensor:
     """Return sigma of DD-5, (B, 1, F, H, W), in the dtype of the mask."""
-    sigma = _rows(_sigma_base(s, settings.eta), mask) * mask
+    sigma = _rows(s * math.sin(math.pi * settings.eta / 2), mask) * mask
     return torch.where(mask > 1, torch.minimum(sigma, SIGMA_LIMIT * _rows(s, mask)), sigma)
 
 
@@ -126,8 +120,7 @@ def _euler_sde(x: Tensor, v: Tensor, t: Tensor, s: Tensor, variance: Tensor, con
     std = _rows(variance.sqrt(), x)
     mean = x + _rows(s - t, x) * v - _rows(variance / (2 * t), x) * eps
     generated = _generated(x, context)
-    slope = _rows((s - t) - variance * (1 - t) / (2 * t), x)
-    return Step(mean, std * generated, std.flatten(), generated, slope)
+    return Step(mean, std * generated, generated)
 
 
 def flow_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerConfig) -> Step:
@@ -158,10 +151,6 @@ KERNELS: dict[str, Kernel] = {
     "dance": dance_step,
     "sage": sage_step,
 }
-
-
-def _sigma_base(s: Tensor, eta: float) -> Tensor:
-    return s * math.sin(math.pi * eta / 2)
 
 
 def _generated(x: Tensor, context: StepContext) -> Tensor:

@@ -1,11 +1,13 @@
 """Sample videos and keep what training needs of them (DD-1, DD-14b).
 
-Shapes: N videos, S stochastic steps, L kept latents, C channels, F latent frames, H W grid, K given frames.
+Shapes: N videos, S stochastic steps, L kept latents, M transitions, C channels, F latent frames, H W grid, K given
+frames, U = C (F - K) H W generated elements.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +19,9 @@ from wm_nodes.video_model.kernels import Step, StepContext, ode_step, step, with
 from wm_nodes.video_model.network import VelocityModel, guided_velocity
 from wm_nodes.video_model.schedule import flow_times
 
+ROWS = ("latents", "states", "mask", "zeta")
+"""Tensors of a VideoRollout that have a row per video."""
+
 
 @dataclass(frozen=True)
 class VideoRollout:
@@ -26,22 +31,19 @@ class VideoRollout:
     """The clean result (N, C, F, H, W), float32."""
     steps: tuple[int, ...]
     """The stochastic steps k, ascending."""
-    state_steps: tuple[int, ...]
-    """Those of `states`; transition k leads from state k to state k + 1."""
     states: Tensor
-    """x before each of state_steps (N, L, C, F, H, W)."""
+    """x before each of state_steps (N, L, C, F, H, W), float32 or bfloat16."""
     mask: Tensor
     """(N, S, 1, F, H, W)."""
-    sigma_base: Tensor
-    """(N, S)."""
     zeta: Tensor
     """Normalised noise (N, S, C, F - K, H, W), float32 or bfloat16."""
-    seeds: Tensor
-    """Of each video's step noise, int64 (N,)."""
     noise_share: Tensor
     """rms of std / s over generated elements, (S,), the noise budget that was spent."""
-    times: Tensor
-    """Of the sampler, float64 (T + 1,); step k leads from times[k] to times[k + 1]."""
+
+    @property
+    def state_steps(self) -> tuple[int, ...]:
+        """Those of `states`; transition k leads from state k to state k + 1."""
+        return tuple(sorted({*self.steps, *(k + 1 for k in self.steps)}))
 
     @property
     def spent_noise(self) -> float:
@@ -50,13 +52,11 @@ class VideoRollout:
 
     def rows(self, index: Tensor | slice) -> "VideoRollout":
         """Some of the videos, as views for a slice; noise_share is that of all."""
-        names = ("latents", "states", "mask", "sigma_base", "zeta", "seeds")
-        return replace(self, **{name: getattr(self, name)[index] for name in names})
+        return replace(self, **{name: getattr(self, name)[index] for name in ROWS})
 
     def to(self, device: torch.device | str) -> "VideoRollout":
-        """The same videos on a device; seeds and times stay in the host's memory."""
-        names = ("latents", "states", "mask", "sigma_base", "noise_share", "zeta")
-        return replace(self, **{name: getattr(self, name).to(device) for name in names})
+        """The same videos on a device."""
+        return replace(self, **{name: getattr(self, name).to(device) for name in (*ROWS, "noise_share")})
 
     def state(self, k: int) -> Tensor:
         """x before step k, (N, C, F, H, W), storage dtype."""
@@ -104,45 +104,42 @@ def sample_videos(
         )
     if settings.sampler.arm == "ode" or settings.sampler.eta == 0:
         chosen = []  # no step has noise
-    rollout = _unsampled(noise, seeds, condition.num_conditioning, settings, chosen)
+    rollout = _unsampled(noise, condition.num_conditioning, settings, chosen)
     spent = torch.zeros(len(chosen), device=noise.device)
     for i in range(0, len(noise), settings.micro_batch):
         rows = slice(i, i + settings.micro_batch)
         part = rollout.rows(rows)
-        squares = _sample(model, condition.rows(rows), noise[rows], settings, part)
+        squares = _sample(model, condition.rows(rows), noise[rows], seeds[rows], settings, part)
         spent.add_(squares, alpha=len(part.latents) / len(noise))
         on_progress(min(rows.stop, len(noise)), len(noise))
     return replace(rollout, noise_share=spent.sqrt().to(rollout.latents.device))
 
 
 def _unsampled(
-    noise: Tensor, seeds: Tensor, num_conditioning: int, settings: RolloutConfig, stochastic: list[int]
+    noise: Tensor, num_conditioning: int, settings: RolloutConfig, stochastic: list[int]
 ) -> VideoRollout:
     """A rollout whose tensors are yet to be written, in place: kept once, without copies of its parts."""
     N, C, frames, H, W = noise.shape
-    S, steps = len(stochastic), tuple(sorted({*stochastic, *(k + 1 for k in stochastic)}))
-    kept = torch.bfloat16 if settings.noise_store == "zeta_bfloat16" else torch.float32
+    S, states = len(stochastic), len({*stochastic, *(k + 1 for k in stochastic)})
+    stored = getattr(torch, settings.storage_dtype)
     device = noise.device if settings.buffer_device == "model" else torch.device("cpu")
     room = partial(torch.empty, dtype=torch.float32, device=device)
     return VideoRollout(
         latents=room(N, C, frames, H, W),
         steps=tuple(stochastic),
-        state_steps=steps,
-        states=room(N, len(steps), C, frames, H, W, dtype=getattr(torch, settings.storage_dtype)),
+        states=room(N, states, C, frames, H, W, dtype=stored),
         mask=room(N, S, 1, frames, H, W),
-        sigma_base=room(N, S),
-        zeta=room(N, S, C, frames - num_conditioning, H, W, dtype=kept),
-        seeds=seeds.clone(),
+        zeta=room(N, S, C, frames - num_conditioning, H, W, dtype=stored),
         noise_share=room(S),
-        times=flow_times(settings.num_steps, settings.shift),
     )
 
 
 def _sample(
-    model: VelocityModel, condition: Condition, noise: Tensor, settings: RolloutConfig, rollout: VideoRollout
+    model: VelocityModel, condition: Condition, noise: Tensor, seeds: Tensor, settings: RolloutConfig,
+    rollout: VideoRollout,
 ) -> Tensor:
     """Sample one micro-batch into its rows of `rollout`; return the squared noise_share of its steps, (S,)."""
-    times, N = rollout.times, len(noise)
+    times, N = flow_times(settings.num_steps, settings.shift), len(noise)
     at = times.to(noise.device)
     storage = getattr(torch, settings.storage_dtype)
     context = StepContext(condition.frames.float(), first_time=float(times[1]))
@@ -158,7 +155,7 @@ def _sample(
             x = with_conditioning(ode_step(x, v, t, s, context, settings.sampler).mean, context.conditioning)
             continue
         law = step(x, v, t, s, context, settings.sampler)
-        z = step_noise(tuple(x.shape[1:]), rollout.seeds, k).to(x.device)
+        z = step_noise(tuple(x.shape[1:]), seeds, k).to(x.device)
         x = with_conditioning((law.mean + law.std * z).to(storage).float(), context.conditioning)
         keep_transition(rollout, k, x, law)
         spent = (law.std[:, :, context.num_conditioning :] / float(times[k + 1])).square()
@@ -173,10 +170,9 @@ def keep_state(rollout: VideoRollout, k: int, x: Tensor) -> None:
 
 
 def keep_transition(rollout: VideoRollout, k: int, x_s: Tensor, law: Step) -> None:
-    """Write what training needs of step k beside its states: mask, sigma_base, normalised noise."""
+    """Write what training needs of step k beside its states: mask and normalised noise."""
     i = rollout.steps.index(k)
     rollout.mask[:, i] = law.mask
-    rollout.sigma_base[:, i] = law.sigma_base
     num_conditioning = x_s.shape[2] - rollout.zeta.shape[3]
     if rollout.zeta.dtype == torch.float32 and rollout.zeta.device == x_s.device:
         normalised_noise(x_s, law, num_conditioning, out=rollout.zeta[:, i])
@@ -188,3 +184,30 @@ def normalised_noise(x_s: Tensor, law: Step, num_conditioning: int, out: Tensor 
     """Return zeta of DD-14b, (x_s - mean) / std on generated frames, (N, C, F - K, H, W), in `out` where given."""
     K = num_conditioning
     return torch.sub(x_s[:, :, K:], law.mean[:, :, K:], out=out).div_(law.std[:, :, K:])
+
+
+class GaussianTransition(NamedTuple):
+    """The Gaussian of M stored transitions under the weights of now."""
+
+    zeta: Tensor
+    """(x_s - mean) / std, (M, U), with gradient."""
+    std: Tensor
+    """(M, U), without."""
+
+
+def transition(
+    model: VelocityModel, condition: Condition, x_t: Tensor, x_s: Tensor, t: Tensor, s: Tensor, mask: Tensor,
+    settings: RolloutConfig,
+) -> GaussianTransition:
+    """Return the normalised noise that leads from x_t to x_s under `model` (DD-1).
+
+    Args:
+        x_t, x_s: stored states (M, C, F, H, W). t, s: float64 (M,), s > 0.
+        mask: the one used at rollout (M, 1, F, H, W).
+    """
+    context = StepContext(condition.frames.float(), float(flow_times(settings.num_steps, settings.shift)[1]), mask)
+    x, K = with_conditioning(x_t.float(), context.conditioning), condition.num_conditioning
+    v = guided_velocity(model, x, t, condition, settings.cfg).float()
+    law = step(x, v, t, s, context, settings.sampler)
+    zeta = normalised_noise(x_s.float(), law, K)
+    return GaussianTransition(zeta.flatten(1), law.std[:, :, K:].expand_as(zeta).flatten(1))

@@ -5,7 +5,6 @@ Shapes: B pictures, H W 3 image (cameras side by side), E episodes, F frames.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +15,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from wm_nodes.config.tasks import success
-from wm_nodes.core.model_folder import ModelFolderError, read_manifest, read_model_file, write_model_folder
+from wm_nodes.core.model_folder import ModelFolderError, read_manifest, write_model_folder
 from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.training.loop import TrainingLoop
-from wm_nodes.training.weights import WeightsError, load_weights, pack_weights
+from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips
-from wm_nodes.video_model.folder import CODEC, read_video_manifest
+from wm_nodes.video_model.folder import CODEC, load_module, read_video_manifest
 from wm_nodes.video_model.tokenizer_codec import Codec
 
 CHANNELS, HIDDEN = (16, 32, 32, 48), 48
@@ -76,24 +75,6 @@ class SuccessReader(nn.Module):
         return self.read(images) >= self.threshold
 
 
-@dataclass(frozen=True)
-class ReaderScores:
-    """What a reader is good for on labelled pictures."""
-
-    precision: float
-    """Of `done`; NaN where nothing is read as done."""
-    recall: float
-    """Of `done`; NaN where nothing is done."""
-    rate: float
-    """Share that is read as done."""
-    labelled: float
-    """Share that is done."""
-    near_half: float
-    """Share that is done of pictures read as 0.4 to 0.6; NaN where there are none."""
-    count: int
-    """Pictures."""
-
-
 def train_success_reader(
     clips: Clips, codec: Codec, num_iterations: int, seed: int, run_dir: Path | None = None
 ) -> SuccessReader:
@@ -131,14 +112,11 @@ def train_success_reader(
     return reader
 
 
-def score_reader(reader: SuccessReader, frames: Tensor, labels: BoolArray) -> ReaderScores:
-    """Compare what is read off pictures, uint8 (..., H, W, 3), with their labels (...,)."""
-    found = reader.read(frames)
-    done, near = found >= reader.threshold, np.abs(found - 0.5) < 0.1
-    return ReaderScores(
-        _mean(labels[done]), _mean(done[labels]), float(done.mean()), float(labels.mean()), _mean(labels[near]),
-        labels.size,
-    )
+def score_reader(reader: SuccessReader, frames: Tensor, labels: BoolArray) -> dict[str, float]:
+    """Return precision and recall of what is read as done off pictures, uint8 (..., H, W, 3), with labels (...,); NaN
+    where nothing is read as done, or nothing is."""
+    done = reader.done(frames)
+    return {"precision": _mean(labels[done]), "recall": _mean(done[labels])}
 
 
 def save_success_reader(folder: Path, reader: SuccessReader, task: str, story: Mapping[str, Any]) -> Path:
@@ -164,11 +142,8 @@ def load_success_reader(folder: Path, task: str, device: torch.device | str = "c
     if manifest["task"] != task:
         raise ModelFolderError(f"{folder} holds a success reader of {manifest['task']}, not {task}; train one for it")
     reader = SuccessReader(manifest["height"], manifest["width"], manifest["threshold"])
-    try:
-        load_weights(reader, read_model_file(folder / WEIGHTS, manifest["sha256"][WEIGHTS]))
-    except WeightsError as error:
-        raise ModelFolderError(f"{folder / WEIGHTS}: {error}") from None
-    return reader.to(device).eval().requires_grad_(False)
+    load_module(folder / WEIGHTS, reader, manifest["sha256"][WEIGHTS])
+    return reader.to(device).requires_grad_(False)
 
 
 def reader_of(folder: Path, task: str, shipped: Path, device: torch.device | str = "cpu") -> SuccessReader | None:

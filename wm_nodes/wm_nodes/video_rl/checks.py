@@ -10,14 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from wm_nodes.config.load import load_video_config
-from wm_nodes.config.video import GrpoConfig, RolloutConfig
+from wm_nodes.config.video import GrpoConfig, RolloutConfig, VideoRlConfig
 from wm_nodes.core.device import device_of
 from wm_nodes.video_model import (
     Condition,
     RolloutBuffer,
     StepContext,
     VideoRollout,
-    config_hash,
     flow_times,
     guided_velocity,
     initial_noise,
@@ -26,6 +25,7 @@ from wm_nodes.video_model import (
 )
 from wm_nodes.video_model.kernels import with_conditioning
 from wm_nodes.video_rl.grpo import GrpoLearner
+from wm_nodes.video_rl.sampling import sample_buffer
 
 RATIO_LIMIT, ODE_LIMIT, KL_LIMIT = 1e-5, 1e-4, 1e-10
 ROUNDED_RATIO_LIMIT, ROUNDED_KL_LIMIT = 1e-4, 3e-6
@@ -50,28 +50,28 @@ class CheckResult:
 
 
 def examine(
-    model: nn.Module, condition: Condition, shape: tuple[int, int, int, int], rollout: RolloutConfig,
-    grpo: GrpoConfig, *, seed: int = 0, buffer_videos: int = 0,
+    model: nn.Module, condition: Condition, shape: tuple[int, int, int, int], config: VideoRlConfig
 ) -> list[CheckResult]:
     """Sample a few videos of shape (C, F, H, W) and check them; the model's weights are as before afterwards.
 
     Args:
         condition: of N >= 2 videos, where the model is; two of them at least should move.
-        buffer_videos: of one buffer in training, for its memory; 0: as many as are sampled here.
+        config: its seed, groups (for the memory of a buffer), window, rollout and grpo are used.
 
     Raises:
         ValueError: nothing can be trained with these settings: a sampler without noise, no step that can train, an
             anchor lora_off without an adapter.
     """
-    seeds = torch.arange(len(condition.actions)) + seed
+    rollout, videos = config.rollout, torch.arange(len(condition.actions))
+    seeds, group = videos + config.seed, torch.zeros_like(videos)
     noise = initial_noise(shape, seeds).to(device_of(model))
     model.eval()
-    sampled = sample_videos(model, condition, noise, seeds, rollout)
+    buffer = sample_buffer(model, config, condition, noise, seeds, group, videos, 0, 0)
+    sampled, trainable = buffer.rollout, [p.requires_grad for p in model.parameters()]
     if not bool(sampled.latents.isfinite().all()):
         return [_report_not_finite(sampled)]
-    buffer, trainable = _make_buffer(sampled, condition, rollout), [p.requires_grad for p in model.parameters()]
     try:
-        learner = GrpoLearner(model, _without_updates(grpo, rollout), rollout, seed=seed)
+        learner = GrpoLearner(model, _without_updates(config.grpo, rollout), rollout, seed=config.seed)
         first = _check_first_update(learner, buffer)
     finally:
         for parameter, trains in zip(model.parameters(), trainable, strict=True):
@@ -83,7 +83,7 @@ def examine(
         _check_ode(model, condition, noise, seeds, rollout),
         _check_mask(sampled, condition.num_conditioning, rollout),
         _check_round_trip(buffer),
-        _measure_memory(learner, sampled, buffer_videos or len(seeds)),
+        _measure_memory(learner, sampled, config.groups.contexts * config.groups.group_size),
     ]
 
 
@@ -138,8 +138,8 @@ def _check_mask(sampled: VideoRollout, num_conditioning: int, rollout: RolloutCo
 
 
 def _check_round_trip(buffer: RolloutBuffer) -> CheckResult:
-    again = RolloutBuffer.from_bytes(buffer.to_bytes())
-    equal, size = again.to_bytes() == buffer.to_bytes(), f"{buffer.num_bytes / MIB:.1f} MiB"
+    data = buffer.to_bytes()
+    equal, size = RolloutBuffer.from_bytes(data).to_bytes() == data, f"{len(data) / MIB:.1f} MiB"
     return CheckResult("a saved buffer comes back equal", equal, size, "report this as a bug")
 
 
@@ -156,7 +156,7 @@ def _measure_memory(learner: GrpoLearner, sampled: VideoRollout, videos: int) ->
 
 def _limits(rollout: RolloutConfig) -> tuple[float, float]:
     """Return the limits of the ratio's distance from 1, and of the KL."""
-    if rollout.noise_store == "zeta_bfloat16":
+    if rollout.storage_dtype == "bfloat16":
         return ROUNDED_RATIO_LIMIT, ROUNDED_KL_LIMIT
     return RATIO_LIMIT, KL_LIMIT
 
@@ -164,12 +164,10 @@ def _limits(rollout: RolloutConfig) -> tuple[float, float]:
 def _without_updates(grpo: GrpoConfig, rollout: RolloutConfig) -> GrpoConfig:
     """Settings of one update that changes no weight; a transition beyond the ratio's limit counts as clipped."""
     limit, _ = _limits(rollout)
-    mode, anchor = "mean", grpo.kl.anchor
-    if grpo.objective == "nft":
-        mode, anchor = "velocity", "lora_off" if anchor == "lora_off" else "frozen"
+    anchor = "frozen" if grpo.objective == "nft" and grpo.kl.anchor != "lora_off" else grpo.kl.anchor
     return grpo.with_values(
-        updates_per_buffer=1, learning_rate=0.0, weight_decay=0.0, ema_decay=0.0,
-        kl=grpo.kl.with_values(mode=mode, beta=1.0, anchor=anchor), clip_low=limit, clip_high=limit,
+        updates_per_buffer=1, learning_rate=0.0, weight_decay=0.0, clip=limit,
+        kl=grpo.kl.with_values(mode="mean", beta=1.0, anchor=anchor),
         advantage=load_video_config("base").grpo.advantage,
     )
 
@@ -183,17 +181,9 @@ def _check_first_update(learner: GrpoLearner, buffer: RolloutBuffer) -> tuple[Ch
         "ratio is 1 on the first update", not has_ratio or (error < ratio_limit and outside == 0),
         f"mean ratio differs from 1 by {error:.1e}, {outside:.0%} of the transitions by more than {ratio_limit:g}"
         if has_ratio else "objective nft has none",
-        "make rollout and training pass alike: rollout.cfg and grpo.cfg, dtype, micro_batch, dropout off, attention "
-        "kernels; noise_store zeta",
+        "make rollout and training pass alike: dtype, micro_batch, dropout off, attention kernels; storage_dtype "
+        "float32",
     ), CheckResult(
         "KL is 0 at the anchor", update.kl < kl_limit, f"{update.kl:.1e} to {learner.settings.kl.anchor}",
         "as for the ratio",
-    )
-
-
-def _make_buffer(sampled: VideoRollout, condition: Condition, rollout: RolloutConfig) -> RolloutBuffer:
-    count = len(sampled.latents)
-    return RolloutBuffer(
-        sampled, condition, torch.zeros(count, dtype=torch.int64), torch.arange(count), {},
-        torch.ones(count, dtype=torch.bool), 0, 0, config_hash(rollout),
     )

@@ -67,8 +67,6 @@ class ClipFaults:
     object_permanence: Tensor
     """1 where the last frame shows at least the limit of pixels that have the colour which the first frame shows at the
     object's place."""
-    object_px: Tensor
-    """Their number."""
     scenery_change: Tensor
     """Mean absolute change since the first frame, [0, 1], of the still cameras' pixels far from tool and object."""
 
@@ -107,12 +105,10 @@ def find_faults(
         raise ValueError(f"clips are {images.shape[2]} px high, the cameras' pictures {scene.cameras[0][1].height} px")
     away = np.linalg.norm(np.subtract(*scene.places(generated)), axis=-1)
     untouched = np.minimum(away[:, :-1], away[:, 1:]) > GHOST_DISTANCE_M
-    pixels = _object_pixels(images, positions, scene)
     values = (
         (untouched & (_step_lengths(generated, scene.thing) > GHOST_STEP_M)).mean(1),
         (_step_lengths(generated, scene.tool) > limits.tool_step_m).mean(1),
-        pixels >= limits.object_px,
-        pixels,
+        _object_pixels(images, positions, scene) >= limits.object_px,
         _scenery_change(images, positions, scene, num_conditioning),
     )
     return ClipFaults(*(torch.from_numpy(np.asarray(value, np.float64)) for value in values))

@@ -1,4 +1,4 @@
-"""Group-relative advantages of GRPO. Shapes: N videos, each of one group (one context); DD-13, DD-13b.
+"""Group-relative advantages of GRPO. Shapes: N videos, each of one group (one context); DD-13, DD-13b, RA-15.
 
 Computed in float64: in float32 a group of equal rewards gets advantages of up to 0.9 from rounding alone.
 """
@@ -6,12 +6,8 @@ Computed in float64: in float32 a group of equal rewards gets advantages of up t
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
-
-from wm_nodes.core.types import BoolArray
 
 FLOOR = 1e-6
 """A group with std < FLOOR max(1, |mean|) has no spread."""
@@ -24,18 +20,20 @@ class GroupAdvantages:
     advantages_N: Tensor
     """float64, 0 where there is none."""
     kept_N: Tensor
-    """bool, videos that train: their reward is valid and their group's rewards differ."""
+    """bool, videos that train: they have a reward, and their group's rewards differ."""
     num_groups: int
     """All of them."""
+    num_dropped: int
+    """Groups of G videos of which fewer than max(2, G / 2) have a reward (RA-15)."""
     num_zero_std: int
-    """Groups without any spread."""
+    """Groups without any spread, those that are dropped among them."""
 
 
 def group_advantages(
-    rewards_N: Tensor, group_ids_N: Tensor, valid_N: Tensor, *, clip: float,
-    std_scope: Literal["group", "global"] = "group",
+    rewards_N: Tensor, group_ids_N: Tensor, *, clip: float, std_scope: Literal["group", "global"] = "group"
 ) -> GroupAdvantages:
-    """Return A_i = clip((R_i - mean_g R) / std_g R, -clip, clip) (DD-13) over the valid videos of each group.
+    """Return A_i = clip((R_i - mean_g R) / std_g R, -clip, clip) (DD-13) over the videos of each group whose reward is
+    finite.
 
     The mean is always the group's. std_scope says which standard deviation:
 
@@ -45,46 +43,26 @@ def group_advantages(
       Contexts of unequal difficulty do not enter it. This is not the global_std of flow_grpo's code, which is the std
       of all rewards about their common mean.
 
-    A group of fewer than two valid videos, or with std < FLOOR max(1, |mean|), has advantages 0 and is counted.
-
-    Raises:
-        ValueError: a reward marked valid is not finite, or a shape differs.
+    A group that is dropped, or with std < FLOOR max(1, |mean|), has advantages 0.
     """
-    if not rewards_N.shape == group_ids_N.shape == valid_N.shape:
-        raise ValueError(
-            f"rewards, group ids and valid must have one shape, got {tuple(rewards_N.shape)}, "
-            f"{tuple(group_ids_N.shape)}, {tuple(valid_N.shape)}"
-        )
-    rewards, valid = rewards_N.double(), valid_N.bool()
-    if not bool(torch.isfinite(rewards[valid]).all()):
-        video = int(torch.nonzero(valid & ~torch.isfinite(rewards))[0])
-        raise ValueError(f"reward of video {video} is {float(rewards[video])}; mark it valid=False to leave it out")
-    deviations, kept = torch.zeros_like(rewards), torch.zeros_like(valid)
-    stds, groups, num_zero = torch.ones_like(rewards), _groups(group_ids_N), 0
+    rewards = rewards_N.double()
+    valid, deviations, stds = torch.isfinite(rewards), torch.zeros_like(rewards), torch.ones_like(rewards)
+    kept, groups, num_dropped, num_zero = torch.zeros_like(valid), _groups(group_ids_N), 0, 0
     for group in groups:
-        members = (group_ids_N == group) & valid
+        of_group = group_ids_N == group
+        members = of_group & valid
         values = rewards[members]
-        std = float(values.std(correction=0)) if len(values) > 1 else 0.0
-        if std < FLOOR * max(1.0, abs(float(values.mean())) if len(values) else 1.0):
+        dropped = len(values) < max(2, int(of_group.sum()) / 2)
+        num_dropped += dropped
+        if dropped or float(values.std(correction=0)) < FLOOR * max(1.0, abs(float(values.mean()))):
             num_zero += 1
             continue
-        deviations[members], stds[members] = values - values.mean(), std
+        deviations[members], stds[members] = values - values.mean(), values.std(correction=0)
         kept |= members
     if std_scope == "global" and bool(kept.any()):
         stds = torch.full_like(stds, float(deviations[kept].square().mean().sqrt()))
     advantages = (deviations / stds).clamp(-clip, clip)
-    return GroupAdvantages(advantages, kept, len(groups), num_zero)
-
-
-def trainable(valid_N: BoolArray, group_ids_N: NDArray[np.int64]) -> BoolArray:
-    """Return which clips train (RA-15), (N,): the valid ones of groups with n_valid >= max(2, G / 2)."""
-    if valid_N.shape != group_ids_N.shape:
-        raise ValueError(f"valid and group ids must have one shape, got {valid_N.shape} and {group_ids_N.shape}")
-    kept = np.zeros(valid_N.shape, bool)
-    for group in np.unique(group_ids_N):
-        members = group_ids_N == group
-        kept[members] = valid_N[members] & (valid_N[members].sum() >= max(2, members.sum() / 2))
-    return kept
+    return GroupAdvantages(advantages, kept, len(groups), num_dropped, num_zero)
 
 
 def best_of_n(advantages_N: Tensor, group_ids_N: Tensor, kept_N: Tensor, n: int) -> Tensor:

@@ -1,5 +1,5 @@
 """RL of a flow-matching video model on a rollout buffer: GRPO (DD-13 to DD-18, DD-20), or with grpo.objective nft
-DiffusionNFT (DD-31); averaged weights: DD-30.
+DiffusionNFT (DD-31).
 
 Shapes: N videos, S stochastic steps, M transitions (video, step) of one network call, U generated elements.
 
@@ -13,11 +13,8 @@ micro-batches.
 
 import json
 import math
-import time
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,16 +23,16 @@ from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 
 from wm_nodes.config.video import GrpoConfig, RolloutConfig
-from wm_nodes.core.device import device_of, synchronize
+from wm_nodes.core.device import device_of
 from wm_nodes.training import checkpoint
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import WeightsError, check_same_layout
 from wm_nodes.video_model.buffer import RolloutBuffer
-from wm_nodes.video_rl.group_advantages import GroupAdvantages, best_of_n, group_advantages, trainable
+from wm_nodes.video_rl.group_advantages import GroupAdvantages, best_of_n, group_advantages
 from wm_nodes.video_rl.nft import NftTerms
 from wm_nodes.video_rl.ratio_and_kl import GrpoTerms, Rows
 
-SUMS = ("objective", "kl", "ratio", "low", "high", "forward_s", "kl_s", "backward_s")
+SUMS = ("objective", "kl", "ratio", "low", "high")
 MAX_SKIPPED = 5
 """So many buffers in a row whose rewards differ in no group end a training: nothing can be learned from the reward."""
 
@@ -44,7 +41,7 @@ MAX_SKIPPED = 5
 class UpdateReport:
     """One optimizer step; see docs/metrics.md.
 
-    With objective nft there is no ratio: it and the clips are NaN, as is the KL without an anchor.
+    With objective nft there is no ratio: it and the clips are NaN.
     """
 
     objective: float
@@ -61,12 +58,6 @@ class UpdateReport:
     """Before it is clipped."""
     transitions: int
     """(video, step) pairs."""
-    forward_seconds: float
-    """Of the weights that train."""
-    kl_seconds: float
-    """The anchor's forward and the KL."""
-    backward_seconds: float
-    """Of both."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +77,7 @@ class BufferReport:
     skipped: int
     """Buffers without updates in a row, up to this one."""
     dropped_groups: int
-    """Those with fewer valid videos than trainable() asks for; they are in zero_std_ratio too."""
+    """Those with too few rewards (RA-15); they are in zero_std_ratio too."""
     kept: int
     """Videos that train."""
     group_size: float
@@ -121,14 +112,15 @@ class GrpoLearner:
         self.ranks = ranks or Ranks()
         self.version = 0
         """Optimizer steps made so far: the policy version of the weights."""
+        self.iterations = 0
+        """Buffers trained on so far, those that were skipped among them."""
         self.skipped = 0
         """Buffers in a row, up to now, that no optimizer step was made on."""
         self.parameters = [p for p in model.parameters() if p.requires_grad]
         self._optimizer = torch.optim.AdamW(
             self.parameters, lr=settings.learning_rate, weight_decay=settings.weight_decay
         )
-        self._terms = (NftTerms if settings.objective == "nft" else GrpoTerms)(model, settings, rollout, seed)
-        self.averaged = self._terms.trained() if settings.ema_decay > 0 else {}
+        self.terms = (NftTerms if settings.objective == "nft" else GrpoTerms)(model, settings, rollout, seed)
 
     def train(self, buffer: RolloutBuffer) -> BufferReport:
         """Make `updates_per_buffer` optimizer steps; nothing has changed when it raises.
@@ -136,28 +128,24 @@ class GrpoLearner:
         A buffer whose rewards differ in no group is skipped: its report has no updates, the weights stay.
 
         Raises:
-            RolloutBufferError: another sampler configuration, or a stale buffer.
-            ValueError: a reward that is marked valid and not finite, no group with enough valid ones, MAX_SKIPPED
-                buffers in a row without spread, or no generated frame.
+            RolloutBufferError: another sampler configuration, or other weights.
+            ValueError: no group with enough finite rewards, MAX_SKIPPED buffers in a row without spread, or no
+                generated frame.
             FloatingPointError: a loss or gradient is not finite.
         """
-        buffer.check(self.rollout, self.version, self.settings.max_staleness)
+        buffer.check(self.rollout, self.version)
         if buffer.condition.num_conditioning >= buffer.rollout.latents.shape[2]:
             raise ValueError(
                 f"all {buffer.rollout.latents.shape[2]} frames of these videos are given: nothing was generated that "
                 f"could be learned from; give fewer"
             )
-        rewards, before = mixed_reward(buffer), self._snapshot()
-        trains = torch.from_numpy(trainable(buffer.valid.numpy(), buffer.group_ids.numpy()))
+        rewards, valid, before = buffer.reward, buffer.valid, self._snapshot()
         settings = self.settings.advantage
-        advantages = group_advantages(
-            rewards, buffer.group_ids, trains, clip=settings.clip, std_scope=settings.std_scope
-        )
-        invalid = int((~buffer.valid).sum())
-        dropped = advantages.num_groups - len(set(buffer.group_ids[trains].tolist()))
+        advantages = group_advantages(rewards, buffer.group_ids, clip=settings.clip, std_scope=settings.std_scope)
+        invalid, dropped = int((~valid).sum()), advantages.num_dropped
         kept = best_of_n(advantages.advantages_N, buffer.group_ids, advantages.kept_N, settings.best_of_n)
         skipped = 0 if bool(kept.any()) else self.skipped + 1
-        if not bool(trains.any()) or skipped >= MAX_SKIPPED:
+        if dropped == advantages.num_groups or skipped >= MAX_SKIPPED:
             raise ValueError(
                 f"nothing to learn from: {invalid} of {len(buffer)} rewards are invalid, {dropped} of "
                 f"{advantages.num_groups} groups have too few valid ones and {advantages.num_zero_std - dropped} no "
@@ -168,14 +156,15 @@ class GrpoLearner:
             steps = self.settings.updates_per_buffer if len(rows) else 0
             updates = tuple(self._update(buffer, rows, advantages) for _ in range(steps))
             if updates:
-                self._terms.move_old(self.version)
+                self.terms.move_old(self.version)
         except BaseException:
             self._restore(before)
             raise
         self.skipped = skipped
+        self.iterations += 1
         return BufferReport(
             updates=updates,
-            reward_mean=float(rewards[buffer.valid].mean()),
+            reward_mean=float(rewards[valid].mean()),
             advantage_abs_mean=float(advantages.advantages_N[kept].abs().mean()),
             zero_std_ratio=advantages.num_zero_std / advantages.num_groups,
             invalid=invalid,
@@ -193,42 +182,25 @@ class GrpoLearner:
 
     def rows(self, buffer: RolloutBuffer, kept_N: Tensor) -> Rows:
         """Return what every update on the buffer trains on: the chosen steps of the kept videos."""
-        return Rows(*torch.nonzero(self._terms.choose(buffer) & kept_N.unsqueeze(1), as_tuple=True))
+        return Rows(*torch.nonzero(self.terms.choose(buffer) & kept_N.unsqueeze(1), as_tuple=True))
 
     def gradients(self, buffer: RolloutBuffer, rows: Rows, advantages: GroupAdvantages) -> dict[str, float]:
         """Accumulate the gradient of L = -J + beta KL over the rows into .grad; return the sums for a report."""
-        device, total, seconds = device_of(self.model), len(rows), [0.0, 0.0, 0.0]
+        device, total = device_of(self.model), len(rows)
         sums = torch.zeros(5, dtype=torch.float64, device=device)
         signals = advantages.advantages_N.to(device, torch.float32)
         own = self.ranks.share(torch.arange(total))
         for index in torch.split(own, self.settings.micro_batch):  # type: ignore[no-untyped-call]
-            clock, part = [self._now(device)], rows.part(index)
-            current: Any = self._terms.objective(buffer, part, signals[part.videos.to(device)], self.version)
-            objective = current.objective
-            clock.append(self._now(device))
-            kl = self._terms.kl(current, buffer, part, self.version)
-            clock.append(self._now(device))
-            loss = (self.settings.kl.beta * kl - objective).sum() / total
-            loss.backward()
-            clock.append(self._now(device))
-            seconds = [spent + end - start for spent, (start, end) in zip(seconds, pairwise(clock), strict=True)]
-            if len(index):  # a share of none is not a number
-                sums[0] += objective.detach().sum().double()
-                sums[1:] += self._terms.sums(current, kl)
-        values = torch.cat([sums.cpu(), torch.tensor(seconds, dtype=torch.float64)])  # the only wait for the device
+            part = rows.part(index)
+            terms = self.terms.compute(buffer, part, signals[part.videos.to(device)], self.version)
+            loss = (self.settings.kl.beta * terms.kl - terms.objective).sum() / total
+            loss.backward()  # type: ignore[no-untyped-call]
+            sums += terms.sums(self.settings.clip)
+        values = sums.cpu()  # the only wait for the device
         self.ranks.sum_(values)
         return dict(zip(SUMS, values.tolist(), strict=True))
 
-    def averaged_weights(self) -> AbstractContextManager[None]:
-        """Return a context in which the model has its averaged weights, for evaluation; without EMA, its own."""
-        return _swap_weights(self.model, self.averaged) if self.averaged else nullcontext()
-
     # internals
-
-    @staticmethod
-    def _now(device: torch.device) -> float:
-        synchronize(device)
-        return time.perf_counter()
 
     def _update(self, buffer: RolloutBuffer, rows: Rows, advantages: GroupAdvantages) -> UpdateReport:
         self.model.train()
@@ -242,53 +214,47 @@ class GrpoLearner:
             )
         self._optimizer.step()
         self.version += 1
-        decay = min(self.settings.ema_decay, (1 + self.version) / (10 + self.version))
-        for name, parameter in _trained_parameters(self.model):
-            if name in self.averaged:
-                self.averaged[name].lerp_(parameter.detach(), 1 - decay)
         total = len(rows.videos)
         return UpdateReport(
             objective=sums["objective"] / total, kl=sums["kl"] / total, ratio_mean=sums["ratio"] / total,
             clip_low_share=sums["low"] / total, clip_high_share=sums["high"] / total, grad_norm=norm,
-            transitions=total, forward_seconds=sums["forward_s"],
-            kl_seconds=sums["kl_s"], backward_seconds=sums["backward_s"],
+            transitions=total,
         )
 
     def _snapshot(self) -> dict[str, Any]:
         """Copy what a failed train() puts back, where it is: on a GPU that is once more the memory of the weights that
-        train, of their two moments and of their average, and nothing crosses to the host."""
+        train and of their two moments, and nothing crosses to the host."""
         return {
-            "model": self._terms.trained(),
+            "model": self.terms.trained(),
             "optimizer": {k: v.detach().clone() for k, v in checkpoint.optimizer_tensors(self._optimizer).items()},
-            "averaged": {name: value.clone() for name, value in self.averaged.items()},
-            "old": self._terms.old,  # replaced, never changed
+            "old": self.terms.old,  # replaced, never changed
             "version": self.version,
         }
 
     def _restore(self, before: dict[str, Any]) -> None:
         _set_trained(self.model, before["model"])
         checkpoint.restore_optimizer(self._optimizer, before["optimizer"])
-        for name, value in before["averaged"].items():
-            self.averaged[name].copy_(value)
-        self._terms.old, self.version = before["old"], before["version"]
+        self.terms.old, self.version = before["old"], before["version"]
 
     # checkpoints
 
-    def save(self, path: Path, *, iteration: int) -> None:
-        """Write everything that train() depends on, atomically: trained, averaged, anchor's and old weights, optimizer,
-        counters."""
+    def save(self, path: Path) -> None:
+        """Write everything that train() depends on, atomically: trained, anchor's and old weights, optimizer, counters.
+        """
         sections = {
-            "model": dict(_trained_parameters(self.model)), "averaged": self.averaged, "anchor": self._terms.anchor,
-            "old": self._terms.old, "optimizer": checkpoint.optimizer_tensors(self._optimizer),
+            "model": dict(_trained_parameters(self.model)), "anchor": self.terms.anchor, "old": self.terms.old,
+            "optimizer": checkpoint.optimizer_tensors(self._optimizer),
         }
-        header = {"version": self.version, "seed": self.seed, "iteration": iteration, "skipped": self.skipped}
+        header = {
+            "version": self.version, "seed": self.seed, "iteration": self.iterations, "skipped": self.skipped
+        }
         checkpoint.write_checkpoint(path, sections, {"grpo": json.dumps(header)})
 
-    def load(self, path: Path) -> int:
-        """Continue exactly from save(); return its iteration.
+    def load(self, path: Path) -> None:
+        """Continue exactly from save().
 
         Raises:
-            ValueError: the file is damaged, or of another architecture, seed, objective, KL anchor or EMA.
+            ValueError: the file is damaged, or of another architecture, seed, objective or KL anchor.
         """
         try:
             tensors, metadata = checkpoint.read_checkpoint(path)
@@ -299,21 +265,17 @@ class GrpoLearner:
             raise ValueError(f"{path} has seed {header['seed']}, this run has {self.seed}; use a new run folder")
         weights = checkpoint.section(tensors, "model.")
         check_same_layout(dict(_trained_parameters(self.model)), weights, what=str(path))
-        own = {
-            "averaged.": (self.averaged, "ema_decay"), "anchor.": (self._terms.anchor, "kl.anchor"),
-            "old.": (self._terms.old, "objective"),
-        }
+        own = {"anchor.": (self.terms.anchor, "kl.anchor"), "old.": (self.terms.old, "objective")}
         for prefix, (values, setting) in own.items():
             if bool(values) != bool(checkpoint.section(tensors, prefix)):
                 raise ValueError(f"{path} was made with another grpo.{setting}; resume with its settings")
         _set_trained(self.model, weights)
         device = device_of(self.model)
-        self.averaged, self._terms.anchor, self._terms.old = (
+        self.terms.anchor, self.terms.old = (
             {name: value.to(device) for name, value in checkpoint.section(tensors, prefix).items()} for prefix in own
         )
         checkpoint.restore_optimizer(self._optimizer, checkpoint.section(tensors, "optimizer."))
-        self.version, self.skipped = header["version"], header["skipped"]
-        return int(header["iteration"])
+        self.version, self.iterations, self.skipped = header["version"], header["iteration"], header["skipped"]
 
 
 def _train_condition(model: nn.Module) -> None:
@@ -326,26 +288,6 @@ def _train_condition(model: nn.Module) -> None:
     model.requires_grad_(False)
     for parameter in condition_parameters():
         parameter.requires_grad_(True)
-
-
-def mixed_reward(buffer: RolloutBuffer) -> Tensor:
-    """Return the reward that trains, float64 (N,): the buffer's `total`, or its only reward."""
-    if "total" in buffer.rewards:
-        return buffer.rewards["total"]
-    if len(buffer.rewards) == 1:
-        return next(iter(buffer.rewards.values()))
-    raise ValueError(f"the buffer holds rewards {', '.join(buffer.rewards) or '(none)'} and no `total`; mix them first")
-
-
-@contextmanager
-def _swap_weights(model: nn.Module, values: dict[str, Tensor]) -> Iterator[None]:
-    """Give the trained parameters other values within the context."""
-    own = {name: p.detach().clone() for name, p in _trained_parameters(model)}
-    _set_trained(model, values)
-    try:
-        yield
-    finally:
-        _set_trained(model, own)
 
 
 def _trained_parameters(model: nn.Module) -> Iterator[tuple[str, Tensor]]:

@@ -1,5 +1,4 @@
-"""Probability ratios, objective and KL of GRPO over Gaussian sampler steps. DD-12, DD-14 to
-DD-17a.
+"""Probability ratios, objective and KL of GRPO over Gaussian sampler steps. DD-12, DD-14 to DD-17a.
 
 Shapes: M transitions, each a (video, step) pair; U generated elements of one latent video. A transition is stored as
 its normalised noise zeta = (x_s - mean) / std, taken after x_s was rounded to its storage type; with std cached, every
@@ -24,22 +23,21 @@ def gaussian_logprob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
 def log_ratio(new_zeta_MU: Tensor, old_zeta_MU: Tensor, weight_MU: Tensor | float = 1.0) -> Tensor:
     """Return the log of DD-15, (M,): mean over elements of weight (zeta_old - zeta_new)(zeta_old + zeta_new) / 2.
 
-    weight (DD-14c): 1 the full likelihood; 2 std^2 CPS's (no 1 / 2 std^2); (std / sigma_base)^2 the same
-    1 / 2 sigma_base^2 for every cell, so that dynamic cells lead.
+    weight (DD-14c): 1 the full likelihood; 2 std^2 CPS's, which has no 1 / 2 std^2.
     """
     return (0.5 * weight_MU * (old_zeta_MU - new_zeta_MU) * (old_zeta_MU + new_zeta_MU)).mean(1)
 
 
-def clipped_objective(log_ratio_M: Tensor, advantages_M: Tensor, *, clip_low: float, clip_high: float) -> Tensor:
-    """Return DD-16 per transition, to be maximised: min(r A, clamp(r, 1 - clip_low, 1 + clip_high) A)."""
+def clipped_objective(log_ratio_M: Tensor, advantages_M: Tensor, clip: float) -> Tensor:
+    """Return DD-16 per transition, to be maximised: min(r A, clamp(r, 1 - clip, 1 + clip) A)."""
     ratio = log_ratio_M.exp()
-    return torch.minimum(ratio * advantages_M, ratio.clamp(1 - clip_low, 1 + clip_high) * advantages_M)
+    return torch.minimum(ratio * advantages_M, ratio.clamp(1 - clip, 1 + clip) * advantages_M)
 
 
-def clip_tails(log_ratio_M: Tensor, *, clip_low: float, clip_high: float) -> tuple[Tensor, Tensor]:
-    """Return the shares of transitions whose ratio lies below 1 - clip_low, and above 1 + clip_high, float64 ()."""
+def clip_tails(log_ratio_M: Tensor, clip: float) -> tuple[Tensor, Tensor]:
+    """Return how many transitions have a ratio below 1 - clip, and above 1 + clip, float64 ()."""
     ratio = log_ratio_M.exp()
-    return (ratio < 1 - clip_low).float().mean().double(), (ratio > 1 + clip_high).float().mean().double()
+    return (ratio < 1 - clip).sum().double(), (ratio > 1 + clip).sum().double()
 
 
 def mean_kl(new_zeta_MU: Tensor, target_zeta_MU: Tensor) -> Tensor:
@@ -50,8 +48,3 @@ def mean_kl(new_zeta_MU: Tensor, target_zeta_MU: Tensor) -> Tensor:
 def log_space_kl(log_ratio_M: Tensor) -> Tensor:
     """Return the k2 estimate (log r)^2 / 2, (M,); DD-17a; far weaker than DD-17."""
     return 0.5 * log_ratio_M.square()
-
-
-def velocity_kl(new_zeta_MU: Tensor, target_zeta_MU: Tensor, std_MU: Tensor, slope_MU: Tensor) -> Tensor:
-    """Return mean over elements of (v_new - v_target)^2 (DD-17a), (M,), from delta mean = slope delta v."""
-    return (std_MU * (target_zeta_MU - new_zeta_MU) / slope_MU).square().mean(1)

@@ -1,9 +1,9 @@
 """Metrics of clips that are never trained on. Shapes: N clips, F frames, H W 3 image, P positions."""
 
-import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +13,6 @@ from torch import Tensor
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.config.tasks import get_task
 from wm_nodes.config.video import VideoRlConfig
-from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import FloatArray
 from wm_nodes.environments.cameras import ROBOT_BASE, still_cameras
 from wm_nodes.environments.replay import execute_paths
@@ -23,9 +22,10 @@ from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_model.success_reader import SuccessReader
 from wm_nodes.video_model.tokenizer_codec import Codec
 from wm_nodes.video_rl.clip_faults import FaultLimits, FilmedScene, find_faults, measure_fault_limits
+from wm_nodes.video_rl.execution_reward import fit_tool_correction
 from wm_nodes.video_rl.reference_reward import score_clips
-from wm_nodes.video_rl.sampling import ClipGenerator
-from wm_nodes.video_rl.validation import evaluated_contexts
+from wm_nodes.video_rl.sampling import sample_by_ode
+from wm_nodes.video_rl.validation import evaluated_contexts, measured_once
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.positions import columns_of, probe_targets
 
@@ -99,21 +99,21 @@ def load_or_measure_unrewarded(
 ) -> Unrewarded:
     """Measure one ODE clip of each of the first `evaluation.contexts` held-out contexts by both models, before and
     after; read from `path` where they are of the same weights, else written there."""
-    weights = [pack_weights(model.network).sha256 for model in models]
-    of = {"sha256": weights, "evaluation": config.evaluation.model_dump()}
-    if path.is_file() and (saved := json.loads(path.read_text(encoding="utf-8")))["of"] == of:
-        return Unrewarded(**saved["found"])
-    try:
-        by = yardstick()
-        (before, missing), (after, missing_after) = (_measure(model, heldout, by, config) for model in models)
+    def measure() -> dict[str, Any]:
+        try:
+            by = yardstick()
+            (before, missing), (after, missing_after) = (_measure(model, heldout, by, config) for model in models)
+        except ValueError as error:
+            return {"before": {}, "after": {}, "missing": dict.fromkeys(UNREWARDED, str(error))}
         missing |= missing_after
         known = [name for name in UNREWARDED if name not in missing]
         first, last = ({name: some[name].tolist() for name in known} for some in (before, after))
-        found = Unrewarded(first, last, missing)
-    except ValueError as error:
-        found = Unrewarded({}, {}, dict.fromkeys(UNREWARDED, str(error)))
-    write_atomic(path, json.dumps({"of": of, "found": asdict(found)}).encode())
-    return found
+        return {"before": first, "after": last, "missing": missing}
+
+    weights = [pack_weights(model.network).sha256 for model in models]
+    return Unrewarded(
+        **measured_once(path, {"sha256": weights, "evaluation": config.evaluation.model_dump()}, measure)
+    )
 
 
 def _measure(
@@ -121,7 +121,7 @@ def _measure(
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
     """All that can be measured, and why something cannot."""
     contexts, missing, given = evaluated_contexts(heldout, config), dict[str, str](), folder.clip["num_conditioning"]
-    frames = ClipGenerator(folder, contexts, config).evaluate(contexts, config.evaluation.num_steps)
+    frames = sample_by_ode(folder, contexts, config, config.evaluation.num_steps)
     positions, count = by.probe.read(frames), min(config.evaluation.executions, len(contexts))
     found = measure_clips(frames, positions, contexts, by, given)
     if by.reader is None:
@@ -140,8 +140,7 @@ def measure_clips(
     frames: Tensor, positions: FloatArray, references: Clips, by: Yardstick, num_conditioning: int
 ) -> dict[str, Tensor]:
     """Return by name, float64 (N,), all scores of ClipScores and ClipFaults of decoded clips, uint8 (N, F, H, W, 3),
-    and where there is a reader `reader_success`: 1 where it sees the task done in the last frame, and
-    `reader_probability` of it.
+    and where there is a reader `reader_success`: 1 where it sees the task done in the last frame.
 
     positions: what the probe reads in the clips, (N, F, P).
     """
@@ -149,32 +148,15 @@ def measure_clips(
     faults = find_faults(frames, positions, by.limits, by.scene, num_conditioning).named()
     if by.reader is None:
         return {**scores, **faults}
-    probability = by.reader.read(frames[:, -1])
-    read = {"reader_success": probability >= by.reader.threshold, "reader_probability": probability}
-    return {**scores, **faults, **{name: torch.from_numpy(value.astype(np.float64)) for name, value in read.items()}}
-
-
-def fit_tool_correction(positions: FloatArray, truth: FloatArray) -> NDArray[np.float64]:
-    """Return the least-squares map (4, 3) from tool positions that the probe reads in decoded recordings to the true
-    ones, both (N, F, 3), with an offset in the last row. Raises ValueError where no true one is known.
-
-    A codec may make the tool look lower than it is: a shipped one does, by 1.1 cm on average and by
-    2.3 cm at heights above 12 cm. Uncorrected, paths that pass over the object touch it when they are executed.
-    """
-    seen, wanted = (values.reshape(-1, 3).astype(np.float64) for values in (positions, truth))
-    known = np.isfinite(wanted).all(1)
-    if not known.any():
-        raise ValueError("the recordings have no simulator state")
-    seen = np.column_stack([seen[known], np.ones(known.sum())])
-    found: NDArray[np.float64] = np.linalg.lstsq(seen, wanted[known], rcond=None)[0]
-    return found
+    read = torch.from_numpy(by.reader.done(frames[:, -1]).astype(np.float64))
+    return {**scores, **faults, "reader_success": read}
 
 
 def measure_executability(
-    positions: FloatArray, references: Clips, by: Yardstick, stride: int, *, num_workers: int = 1
+    positions: FloatArray, references: Clips, by: Yardstick, stride: int
 ) -> dict[str, Tensor]:
     """Return by name, float64 (N,), what comes of the clips' tool paths in the simulator (execute_paths):
-    `executed_success`, `executed_object_cm`, `executed_tool_cm`.
+    `executed_success`, `executed_object_cm`.
 
     positions: read by the probe in decoded clips, (N, F, P).
 
@@ -183,13 +165,12 @@ def measure_executability(
     """
     paths = (positions[..., by.scene.tool] @ by.correction[:3] + by.correction[3]).astype(np.float32)
     executed = execute_paths(
-        references.task, by.simulation, references.seeds, paths, positions[:, -1, by.scene.thing], stride,
-        num_workers=num_workers,
+        references.task, by.simulation, references.seeds, paths, positions[:, -1, by.scene.thing], stride
     )
     recorded = references.ground_truth[:, 0]
     other = [not np.allclose(*both, atol=SAME_SCENE) for both in zip(executed.starts, recorded, strict=True)]
     if any(other):
         seed = references.seeds[other.index(True)]
         raise ValueError(f"the simulator's scene of reset seed {seed} is not the recording's")
-    values = {"success": executed.success, "object_cm": executed.object_error_cm, "tool_cm": executed.tool_error_cm}
-    return {f"executed_{name}": torch.from_numpy(np.asarray(value, np.float64)) for name, value in values.items()}
+    values = zip(EXECUTED, (executed.success, executed.object_error_cm), strict=True)
+    return {name: torch.from_numpy(np.asarray(value, np.float64)) for name, value in values}

@@ -3,23 +3,19 @@
 Shapes: E contexts, n clips of a group, F frames.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor
 
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.statistics import bootstrap_mean
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_rl.reference_reward import all_scores, mix_rewards, score_clips
-from wm_nodes.video_rl.sampling import ClipGenerator, GroupRequest
+from wm_nodes.video_rl.reference_reward import mix_rewards, score_clips
+from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
 from wm_nodes.world_model.position_probe import PositionProbe
 
-LEAST_SHARE = 0.1
-"""A group whose best clip closes less than this share of the gap between a clip's reward and that of a recording seen
-through the codec has nothing to teach: the number is a judgement, not a theorem."""
 DRIFT = ("tool_cm", "object_cm", "psnr_db")
 Interval = tuple[float, float, float]
 """Mean over contexts and its 95 % bootstrap interval."""
@@ -52,25 +48,9 @@ class Headroom:
         gap = self.codec - self.reward
         return self.gain[2] / gap if gap > 0 else 0.0
 
-    @property
-    def can_learn(self) -> bool:
-        return self.share >= LEAST_SHARE
-
-    def text(self) -> str:
-        """One sentence."""
-        if self.codec <= self.reward:
-            return f"clip {self.clips}: as good as the codec allows; nothing is left to learn"
-        if self.can_learn:
-            return f"clip {self.clips}: the best of a group closes up to {self.share:.0%} of the gap to the codec"
-        return (
-            f"clip {self.clips}: no group method can learn here: the best of a group closes at most {self.share:.1%} "
-            f"of the gap to the codec (below {LEAST_SHARE:.0%}); add noise, or train on recordings"
-        )
-
 
 def measure_headroom(
-    folder: VideoFolder, contexts: Clips, config: VideoRlConfig, probe: PositionProbe,
-    on_horizon: Callable[[], object] = lambda: None,
+    folder: VideoFolder, contexts: Clips, config: VideoRlConfig, probe: PositionProbe
 ) -> list[Headroom]:
     """Return the head-room of groups.group_size clips by the rewards of `config`, one per horizon, or only that of
     whole clips where the model makes such.
@@ -81,17 +61,15 @@ def measure_headroom(
     config = config.with_values(groups=config.groups.with_values(history=0), window=config.window.with_values(
         strategy="all"
     ))
-    generator, n, found = ClipGenerator(folder, contexts, config), config.groups.group_size, list[Headroom]()
+    source, n, found = RecordedContexts(folder, contexts, config, probe), config.groups.group_size, list[Headroom]()
     plain = GroupRequest(tuple(range(len(contexts))), n, 0, 0, config.groups.shared_noise)
     for history in _histories(folder, contexts):
         request = replace(plain, history=history, iteration=history or 0)
-        buffer, recorded = generator.sample(request), generator.references(request)
-        K, one = buffer.condition.num_conditioning, recorded.select(torch.arange(0, len(recorded), n))
-        codec, weights = folder.codec, config.rewards
-        scores = all_scores(codec.decode(buffer.rollout.latents), recorded, probe, codec, K, weights)
-        coded = codec.decode(codec.encode(one.frames))
-        ceiling = mix_rewards(all_scores(coded, one, probe, codec, K, weights), weights)
-        rewards = mix_rewards(scores, weights).view(-1, n)
+        buffer = source.score(request, source.sample(request))
+        single, K = replace(request, group_size=1), buffer.condition.num_conditioning
+        coded = folder.codec.decode(folder.codec.encode(source.references(single).frames))
+        ceiling = mix_rewards(source.scores(single, coded, K), config.rewards)
+        rewards = buffer.rewards["total"].view(-1, n)
         best = rewards.argmax(1, keepdim=True)
 
         def gained(values: Tensor, sign: int, best: Tensor = best) -> Interval:
@@ -101,9 +79,8 @@ def measure_headroom(
         found.append(Headroom(
             (history or 0) + 1, float(rewards.mean()), float(rewards.amax(1).mean()), gained(rewards, 1),
             float(rewards.std(1, correction=0).mean()), float(ceiling.mean()),
-            gained(scores["object_cm"], -1), gained(scores["tool_cm"], -1),
+            gained(buffer.rewards["object_cm"], -1), gained(buffer.rewards["tool_cm"], -1),
         ))
-        on_horizon()
     return found
 
 

@@ -4,14 +4,14 @@ from any sampler.
 Shapes: M rows (video, forward time) of one network call, U generated elements.
 
 v_old is the velocity of the old weights, a copy of the parameters that train. With nft.old_decay 0 it is theirs at the
-buffer's first update: unless the buffer is stale, those that sampled it. With nft.old_decay > 0 it lags behind, while
-the current weights go on sampling; the authors let the old ones sample.
+buffer's first update: those that sampled it. With nft.old_decay > 0 it lags behind, while the current weights go on
+sampling; the authors let the old ones sample.
 
 Times are those of the sampler in density: uniform, one in each of nft.times equal parts of (0, 1), then shifted by
 rollout.shift. Theirs are the sampler's own times, all of them, each with a noise of its own.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -23,25 +23,10 @@ from wm_nodes.video_model.buffer import RolloutBuffer
 from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.kernels import with_conditioning
 from wm_nodes.video_model.network import guided_velocity
-from wm_nodes.video_rl.ratio_and_kl import Anchored, Rows
+from wm_nodes.video_rl.ratio_and_kl import Anchored, LossTerms, Rows
 
 LEAST_ERROR = 1e-5
 """Below this mean absolute error the adaptive weight no longer grows."""
-
-
-class ForwardPass(NamedTuple):
-    """One pass of the current weights at x_t."""
-
-    objective: Tensor
-    """(M,), with gradient."""
-    v: Tensor
-    """(M, U), with gradient."""
-    x_t: Tensor
-    """The noised clips; with t and condition what the network was asked, for the anchor."""
-    t: Tensor
-    """float64 (M,)."""
-    condition: Condition
-    """Of every row."""
 
 
 class NftTerms(Anchored):
@@ -61,8 +46,8 @@ class NftTerms(Anchored):
         """Return which forward times train, bool (N, times): all."""
         return torch.ones(len(buffer), self.settings.nft.times, dtype=torch.bool)
 
-    def objective(self, buffer: RolloutBuffer, rows: Rows, signals_M: Tensor, version: int) -> ForwardPass:
-        """Noise the clips, run the current and the old weights, and return minus the loss of DD-31.
+    def compute(self, buffer: RolloutBuffer, rows: Rows, signals_M: Tensor, version: int) -> LossTerms:
+        """Noise the clips, run the current and the old weights, and return minus the loss of DD-31, and the KL.
 
         signals_M: the advantages. version: optimizer steps made; with the numbers of a row it decides time and noise.
         """
@@ -84,31 +69,20 @@ class NftTerms(Anchored):
         good, bad = (adaptive_error(error) for error in errors)
         share_good = (signals_M / (2 * clip) + 0.5).clamp(0, 1)
         loss = clip * (share_good * good + (1 - share_good) * bad) / nft.beta
-        return ForwardPass(-loss, v, x_t, t, condition)
+        return LossTerms(-loss, self.kl(v, x_t, t, condition), None)
 
-    def kl(self, current: ForwardPass, buffer: RolloutBuffer, rows: Rows, version: int) -> Tensor:
-        """Return mean over elements of |v - v_anchor|^2 (DD-17a), (M,); 0 without an anchor."""
-        if not self._has_kl:
-            return torch.zeros_like(current.objective)
+    def kl(self, v: Tensor, x_t: Tensor, t: Tensor, condition: Condition) -> Tensor:
+        """Return mean over elements of |v - v_anchor|^2 (DD-17a), (M,), of the velocities at x_t."""
+        if not self.settings.kl.beta:
+            return v.new_zeros(len(v))
         with torch.no_grad(), self.anchored() as model:
-            anchor = self._velocity(model, current.x_t, current.t, current.condition)
-        return (current.v - anchor).square().mean(1)
-
-    def sums(self, current: ForwardPass, kl: Tensor) -> Tensor:
-        """Return the sum of kl, NaN without an anchor, and NaN for ratio and clips, float64 (4,)."""
-        missing = kl.new_full((4,), torch.nan, dtype=torch.float64)
-        if self._has_kl:
-            missing[0] = kl.detach().sum()
-        return missing
+            anchor = self._velocity(model, x_t, t, condition)
+        return (v - anchor).square().mean(1)
 
     # internals
 
-    @property
-    def _has_kl(self) -> bool:
-        return self.settings.kl.mode != "none" and self.settings.kl.beta > 0
-
     def _velocity(self, model: Any, x: Tensor, t: Tensor, condition: Condition) -> Tensor:
-        v = guided_velocity(model, x, t, condition, self.settings.cfg).float()
+        v = guided_velocity(model, x, t, condition, self.rollout.cfg).float()
         return v[:, :, condition.num_conditioning :].flatten(1)
 
     def _call_old(self, *arguments: Any) -> Any:

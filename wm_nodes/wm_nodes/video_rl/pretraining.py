@@ -1,6 +1,5 @@
 """From clips to a video model: codec, flow matching, held-out scores. Resumable; what is finished is kept."""
 
-from dataclasses import asdict
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -65,9 +64,9 @@ def make_video_model(
     story["heldout"] = means | _score_baselines(model, heldout, probe, config)
     if shipped is None and (config.model.training.hide_actions or config.model.training.given_frames):
         reader = train_success_reader(clips, model.codec, READER_ITERATIONS, config.seed, run_dir)
-        found = score_reader(reader, heldout.frames, success(heldout.task, heldout.ground_truth))
-        told = {"seed": config.seed, "command": command, "heldout": asdict(found)}
-        save_success_reader(folder, reader, clips.task, told)
+        scores_of_reader = score_reader(reader, heldout.frames, success(heldout.task, heldout.ground_truth))
+        made = {"seed": config.seed, "command": command, "heldout": scores_of_reader}
+        save_success_reader(folder, reader, clips.task, made)
     save_video_folder(folder, model.codec, model.network, model.clip, story)
     return load_video_folder(folder, device)
 

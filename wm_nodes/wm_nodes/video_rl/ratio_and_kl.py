@@ -16,18 +16,8 @@ from torch.func import functional_call
 
 from wm_nodes.config.video import GrpoConfig, RolloutConfig
 from wm_nodes.core.device import device_of
-from wm_nodes.video_model.buffer import RolloutBuffer
-from wm_nodes.video_model.schedule import flow_times
-from wm_nodes.video_model.step_window import select_steps
-from wm_nodes.video_model.transitions import GaussianTransition, transition
-from wm_nodes.video_rl.grpo_math import (
-    clip_tails,
-    clipped_objective,
-    log_ratio,
-    log_space_kl,
-    mean_kl,
-    velocity_kl,
-)
+from wm_nodes.video_model import GaussianTransition, RolloutBuffer, flow_times, select_steps, transition
+from wm_nodes.video_rl.grpo_math import clip_tails, clipped_objective, log_ratio, log_space_kl, mean_kl
 
 
 @dataclass(frozen=True)
@@ -52,17 +42,25 @@ class Rows:
         return stored[index[0], index[1]]
 
 
-class Pass(NamedTuple):
-    """One pass of the current weights."""
+class LossTerms(NamedTuple):
+    """What the loss is made of, (M,), with gradient."""
 
     objective: Tensor
-    """(M,), with gradient."""
-    new: GaussianTransition
-    """With gradient."""
-    old_zeta: Tensor
-    """Of the rollout, (M, U)."""
-    log_ratio: Tensor
-    """(M,), with gradient."""
+    """To be maximised."""
+    kl: Tensor
+    """To the anchor; 0 where it has no weight."""
+    log_ratio: Tensor | None
+    """Of DD-15; None with objective nft."""
+
+    def sums(self, clip: float) -> Tensor:
+        """Return the sums of objective, kl and ratio, and the counts of ratios beyond either clip, float64 (5,); NaN
+        where there is no ratio."""
+        sums = torch.full((5,), torch.nan, dtype=torch.float64, device=self.kl.device)
+        sums[0], sums[1] = self.objective.detach().sum().double(), self.kl.detach().sum().double()
+        if self.log_ratio is not None:
+            ratio = self.log_ratio.detach()
+            sums[2:] = torch.stack([ratio.exp().sum().double(), *clip_tails(ratio, clip)])
+        return sums
 
 
 class Anchored:
@@ -116,68 +114,57 @@ class GrpoTerms(Anchored):
     def choose(self, buffer: RolloutBuffer) -> Tensor:
         """Return which transitions train, bool (N, S)."""
         return select_steps(
-            self._times, list(buffer.rollout.steps), len(buffer), fraction=self.settings.step_fraction,
-            min_s=self.settings.min_s, seed=self.seed, iteration=buffer.iteration,
+            len(buffer.rollout.steps), len(buffer), fraction=self.settings.step_fraction, seed=self.seed,
+            iteration=buffer.iteration,
         )
 
-    def objective(self, buffer: RolloutBuffer, rows: Rows, signals_M: Tensor, version: int) -> Pass:
-        """Run the current weights; return DD-16 of DD-15. signals_M: the advantages."""
+    def compute(self, buffer: RolloutBuffer, rows: Rows, signals_M: Tensor, version: int) -> LossTerms:
+        """Run the current weights; return DD-16 of DD-15, and the KL.
+
+        Args:
+            signals_M: the advantages. version: optimizer steps made, for the dual anchor.
+        """
         new = self._transition(self.model, buffer, rows)
         old_zeta = rows.of(buffer.rollout.zeta).flatten(1).float().to(new.zeta.device)
         ratio = self._log_ratio(new, old_zeta)
-        return Pass(clipped_objective(ratio, signals_M, **self._limits), new, old_zeta, ratio)
+        objective = clipped_objective(ratio, signals_M, self.settings.clip)
+        return LossTerms(objective, self.kl(new, old_zeta, buffer, rows, version), ratio)
 
-    def kl(self, current: Pass, buffer: RolloutBuffer, rows: Rows, version: int) -> Tensor:
-        """Return DD-17 or DD-20 per transition, (M,). version: optimizer steps made, for the dual anchor."""
-        settings, kl = self.settings.kl, torch.zeros_like(current.log_ratio)
-        if settings.mode == "none" or settings.beta == 0:
+    def kl(
+        self, new: GaussianTransition, old_zeta: Tensor, buffer: RolloutBuffer, rows: Rows, version: int
+    ) -> Tensor:
+        """Return DD-17 or DD-20 per transition, (M,). old_zeta: of the rollout, (M, U)."""
+        settings, kl = self.settings.kl, torch.zeros(len(rows), device=old_zeta.device)
+        if settings.beta == 0:
             return kl
         if settings.anchor in ("buffer", "dual"):
-            kl = kl + self._distance(current.new, current.old_zeta)
+            kl = kl + self._distance(new, old_zeta)
         due = settings.anchor in ("frozen", "lora_off") or version % settings.dual_every == 0
         if settings.anchor != "buffer" and due:
-            kl = kl + self._distance(current.new, self._anchor_zeta(buffer, rows))
+            kl = kl + self._distance(new, self._anchor_zeta(buffer, rows))
         return kl
-
-    def sums(self, current: Pass, kl: Tensor) -> Tensor:
-        """Return the sums of kl and ratio, and the counts of ratios beyond either clip, float64 (4,)."""
-        ratio = current.log_ratio.detach()
-        tails = [share * len(ratio) for share in clip_tails(ratio, **self._limits)]
-        return torch.stack([kl.detach().sum().double(), ratio.exp().sum().double(), *tails])
 
     # internals
 
-    @property
-    def _limits(self) -> dict[str, float]:
-        return {"clip_low": self.settings.clip_low, "clip_high": self.settings.clip_high}
-
-    @property
-    def _times(self) -> Tensor:
-        return flow_times(self.rollout.num_steps, self.rollout.shift)
-
     def _transition(self, model: Callable[..., Any], buffer: RolloutBuffer, rows: Rows) -> GaussianTransition:
-        device, rollout, times = device_of(self.model), buffer.rollout, self._times
+        device, rollout = device_of(self.model), buffer.rollout
+        times = flow_times(self.rollout.num_steps, self.rollout.shift)
         steps = torch.tensor(rollout.steps)[rows.positions]
         where = torch.tensor([rollout.state_steps.index(k) for k in rollout.steps])[rows.positions]
         x_t, x_s = (rows.of(rollout.states, places).to(device) for places in (where, where + 1))
         t, s = times[torch.stack([steps, steps + 1])].to(device)
         condition = buffer.condition.rows(rows.videos.to(buffer.condition.frames.device)).to(device)
         mask = rows.of(rollout.mask).to(device)
-        return transition(model, condition, x_t, x_s, t, s, mask, self.rollout, cfg=self.settings.cfg)
+        return transition(model, condition, x_t, x_s, t, s, mask, self.rollout)
 
     def _log_ratio(self, new: GaussianTransition, old_zeta: Tensor) -> Tensor:
-        weight: Tensor | float = 1.0
-        if self.settings.logprob_weight == "cps":
-            weight = 2 * new.std.square()
-        elif self.settings.logprob_weight == "base":
-            weight = (new.std / new.sigma_base.unsqueeze(1)).square()
-        return log_ratio(new.zeta, old_zeta, weight)
+        return log_ratio(
+            new.zeta, old_zeta, 2 * new.std.square() if self.settings.logprob_weight == "cps" else 1.0
+        )
 
     def _distance(self, new: GaussianTransition, target_zeta: Tensor) -> Tensor:
         if self.settings.kl.mode == "logk2":
             return log_space_kl(self._log_ratio(new, target_zeta))
-        if self.settings.kl.mode == "velocity":
-            return velocity_kl(new.zeta, target_zeta, new.std, new.slope)
         return mean_kl(new.zeta, target_zeta)
 
     @torch.no_grad()

@@ -26,6 +26,7 @@ from wm_nodes.recording.raw import PARTIAL_SUFFIX
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.tokenizer_codec import Codec
+from wm_nodes.video_rl.execution_reward import EXECUTION_SCORES, ExecutionReward
 from wm_nodes.video_rl.reference_reward import all_scores, attach_rewards, mix_rewards
 from wm_nodes.world_model.position_probe import PositionProbe
 
@@ -58,8 +59,6 @@ class RecordedClips:
     """Of the scores in the total."""
     audit_ids: tuple[str, ...] = ()
     """Of the agent's verdicts (N,), "" for a failed one; () where it was not called."""
-    judge_id: str = ""
-    """"" without a judge."""
 
     def frames(self, height: int, width: int) -> Tensor:
         """The clips, uint8 (N, F, H, W, 3), cut out of the picture.
@@ -169,12 +168,13 @@ def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
                 clips[message.sha256] = message
             elif (batch := clips.pop(message.buffer_sha256, None)) is not None:
                 picture = shown.pop(stamp_ns(batch.header.stamp), None)
-                yield _join_scores(batch, message, picture, *_match_audit_ids(verdicts, message))
+                yield _join_scores(batch, message, picture, _match_audit_ids(verdicts, message))
 
 
 def rescore(
     recorded: RecordedClips, contexts: Clips, probe: PositionProbe, codec: Codec, rewards: Mapping[str, float],
     num_conditioning: int, judge: BufferJudge | None = None, first: int = 0,
+    execution: ExecutionReward | None = None,
 ) -> Rescored:
     """Score the pictures against the recordings of their contexts and compare with the recorded scores, bit for bit.
 
@@ -183,6 +183,7 @@ def rescore(
         rewards: weights of the total; where other scores have a weight than were recorded, the total is not compared.
         judge: called where the agent is among the rewards.
         first: frame of the recordings that the clips begin with.
+        execution: of the same contexts, where it is among the rewards.
 
     Raises:
         BagError: no picture, or scores that cannot be computed from pictures.
@@ -195,8 +196,11 @@ def rescore(
         )
     references = contexts.select(recorded.contexts).window(first, recorded.num_frames)
     frames = recorded.frames(*references.frames.shape[2:4]).to(device_of(probe))
-    scores = all_scores(frames, references, probe, codec, num_conditioning, {*recorded.scores, *rewards})
-    unknown, verdicts = sorted(set(recorded.scores) - set(scores) - {AGENT}), tuple[Mapping[str, Any], ...]()
+    scores = all_scores(
+        frames, references, probe, codec, num_conditioning, {*recorded.scores, *rewards}, execution
+    )
+    asked = {AGENT, *EXECUTION_SCORES}  # given only where they are among the rewards
+    unknown, verdicts = sorted(set(recorded.scores) - set(scores) - asked), tuple[Mapping[str, Any], ...]()
     if judge is not None and rewards.get(AGENT):
         verdict = judge(recorded, frames, references)
         verdicts = verdict.verdicts
@@ -261,38 +265,27 @@ def trained_clips(bags: Sequence[Path], iterations: int) -> list[RecordedClips]:
     return [clips[iteration] for iteration in range(iterations)]
 
 
-def _read_verdicts(bag: Bag) -> dict[tuple[str, int], list[tuple[int, str, str]]]:
-    """Return (stamp in ns, audit id, judge id) of every verdict on a clip (sha256 of its buffer, row), in the order of
-    their stamps; the audit id of a failed one is ""."""
-    verdicts = defaultdict[tuple[str, int], list[tuple[int, str, str]]](list)
+def _read_verdicts(bag: Bag) -> dict[tuple[str, int], list[tuple[int, str]]]:
+    """Return (stamp in ns, audit id) of every verdict on a clip (sha256 of its buffer, row), in the order of their
+    stamps; the audit id of a failed one is ""."""
+    verdicts = defaultdict[tuple[str, int], list[tuple[int, str]]](list)
     name = topics.absolute(topics.DEFAULT_NAMESPACE, topics.VERDICT)
     for _, _, data in bag.messages([name]) if bag.count(name) else ():
         message = bag.decode(data, topics.VERDICT.msgtype)
         audit_id = "" if message.status == message.ERROR else str(message.audit_id)
-        key = message.buffer_sha256, int(message.clip)
-        verdicts[key].append((stamp_ns(message.header.stamp), audit_id, str(message.judge_id)))
+        verdicts[message.buffer_sha256, int(message.clip)].append((stamp_ns(message.header.stamp), audit_id))
     return {key: sorted(values) for key, values in verdicts.items()}
 
 
-def _match_audit_ids(
-    verdicts: Mapping[tuple[str, int], list[tuple[int, str, str]]], scores: Any
-) -> tuple[tuple[str, ...], str]:
-    """Return the audit ids of the verdicts behind a ClipScores, of each clip the newest before, and their judge.
-
-    Empty where a verdict is missing.
-    """
-    until, matches = stamp_ns(scores.header.stamp), list[tuple[str, str]]()
+def _match_audit_ids(verdicts: Mapping[tuple[str, int], list[tuple[int, str]]], scores: Any) -> tuple[str, ...]:
+    """Return the audit ids of the verdicts behind a ClipScores, each clip's newest before; () where one is missing."""
+    until, matches = stamp_ns(scores.header.stamp), list[str]()
     for clip in range(int(scores.num_clips)):
-        before = [ids for stamp, *ids in verdicts.get((scores.buffer_sha256, clip), ()) if stamp <= until]
-        matches += [(audit_id, judge_id) for audit_id, judge_id in before[-1:]]
-    if not matches or len(matches) != int(scores.num_clips):
-        return (), ""
-    return tuple(audit_id for audit_id, _ in matches), matches[0][1]
+        matches += [audit for stamp, audit in verdicts.get((scores.buffer_sha256, clip), ()) if stamp <= until][-1:]
+    return tuple(matches) if len(matches) == int(scores.num_clips) else ()
 
 
-def _join_scores(
-    batch: Any, scores: Any, picture: UInt8Array | None, audit_ids: tuple[str, ...], judge_id: str
-) -> RecordedClips:
+def _join_scores(batch: Any, scores: Any, picture: UInt8Array | None, audit_ids: tuple[str, ...]) -> RecordedClips:
     count = int(scores.num_clips)
     values = torch.from_numpy(np.array(scores.values, np.float64)).view(len(scores.names), count)
     valid = torch.from_numpy(np.array(scores.valid, np.uint8)).bool()
@@ -301,7 +294,7 @@ def _join_scores(
     return RecordedClips(
         int(batch.iteration), int(batch.policy_version), contexts, int(batch.num_frames), batch.buffer_uri,
         batch.sha256, dict(zip(scores.names, values, strict=True)), torch.where(valid, total, torch.nan), valid,
-        picture, dict(zip(scores.names, map(float, scores.weights), strict=True)), audit_ids, judge_id,
+        picture, dict(zip(scores.names, map(float, scores.weights), strict=True)), audit_ids,
     )
 
 

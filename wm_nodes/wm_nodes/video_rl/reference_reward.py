@@ -7,7 +7,7 @@ the held-out metrics beside which a judge's reward is watched (DD-2).
 """
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from wm_nodes.reward.picture_similarity import psnr_db, ssim
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.tokenizer_codec import Codec
+from wm_nodes.video_rl.execution_reward import ExecutionReward
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.positions import columns_of, probe_targets
@@ -67,12 +68,17 @@ class ClipScores:
 
 def all_scores(
     frames: Tensor, references: Clips, probe: PositionProbe, codec: Codec, num_conditioning: int,
-    wanted: Collection[str],
+    wanted: Collection[str], execution: ExecutionReward | None = None,
 ) -> dict[str, Tensor]:
-    """Return the scores of score_clips() by name, and PICTURE_SCORES, which cost twice as much, where one is wanted."""
+    """Return the scores of score_clips() by name, and PICTURE_SCORES, which cost twice as much, where one is wanted.
+
+    execution: what load_execution_reward gives; its scores are among them.
+    """
     scores = score_clips(frames, references, probe, num_conditioning).named()
     if any(name in wanted for name in PICTURE_SCORES):
         scores |= score_pictures(frames, references, codec, num_conditioning)
+    if execution is not None:
+        scores |= execution.score(frames, references)
     return scores
 
 
@@ -180,9 +186,7 @@ def mix_rewards(values: Mapping[str, Tensor], weights: Mapping[str, float]) -> T
 
 def attach_rewards(buffer: RolloutBuffer, scores: Mapping[str, Tensor], total: Tensor) -> RolloutBuffer:
     """Return the buffer with raw scores and the mixed reward `total`; a clip whose total is NaN does not train."""
-    raw = {name: values.double().cpu() for name, values in scores.items()}
-    scored = buffer.with_rewards({"total": total})
-    return replace(scored, rewards={**raw, **scored.rewards})
+    return buffer.with_rewards({**scores, "total": total})
 
 
 def _check_sizes(frames: Tensor, references: Clips) -> None:

@@ -20,6 +20,7 @@ from wm_nodes.video_model import (
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.continuation import ClipLengths, clip_condition, continue_videos
 from wm_nodes.video_model.folder import VideoFolder
+from wm_nodes.video_rl.execution_reward import load_execution_reward
 from wm_nodes.video_rl.reference_reward import all_scores, attach_rewards, mix_rewards
 from wm_nodes.world_model.position_probe import PositionProbe
 
@@ -74,16 +75,13 @@ def sample_buffer(
     RolloutBuffer.
     """
     settings = config.rollout
-    steps = stochastic_steps(settings.num_steps, config.window, iteration, config.seed)
+    steps = stochastic_steps(settings.num_steps, config.window, iteration)
     device = device_of(network)
     condition = condition.to(device)
     with explain_memory(device, rollout__micro_batch=settings.micro_batch, groups__contexts=config.groups.contexts):
         rollout = sample_videos(network, condition, noise.to(device), seeds, settings, steps, on_progress)
     condition = condition.to(rollout.latents.device)
-    valid = torch.ones(len(groups), dtype=torch.bool)
-    return RolloutBuffer(
-        rollout, condition, groups, samples, {}, valid, policy_version, iteration, config_hash(settings)
-    )
+    return RolloutBuffer(rollout, condition, groups, samples, {}, policy_version, iteration, config_hash(settings))
 
 
 class ClipGenerator:
@@ -127,7 +125,9 @@ class ClipGenerator:
         seeds = _seeds(self.config.seed, "clip_steps", request.iteration, group, sample)
         noises = torch.zeros_like(sample) if request.shared_noise else sample
         condition = self.condition(request)
-        shape = self._shape(condition.actions.shape[1] + 1)
+        _, _, H, W, _ = self.contexts.frames.shape
+        codec = self.folder.codec
+        shape = codec.channels, condition.actions.shape[1] + 1, H // codec.patch, W // codec.patch
         noise = initial_noise(shape, _seeds(self.config.seed, "clip_noise", request.iteration, group, noises))
         return sample_buffer(
             self.folder.network, self.config, condition, noise, seeds, group, sample, request.iteration,
@@ -137,7 +137,7 @@ class ClipGenerator:
     def condition(self, request: GroupRequest) -> Condition:
         """Return what the request's clips are made of, a row per clip: recorded first frames, or the last frames of its
         history, which the model makes here by ODE, once per context."""
-        start = self._condition(torch.tensor(request.contexts))
+        start = _condition(self.folder, self.contexts.select(torch.tensor(request.contexts)), self.config)
         if request.history is None:
             return start.repeat_interleave(request.group_size)
         lengths, contexts = self._lengths(), torch.arange(len(request.contexts))
@@ -146,28 +146,10 @@ class ClipGenerator:
             of = torch.full_like(contexts, clip)
             return initial_noise(shape, _seeds(self.config.seed, "history_noise", request.iteration, contexts, of))
 
-        frames, settings = self._made(request.history), self._ode(self.config.rollout.num_steps)
+        frames, settings = self._made(request.history), _ode(self.config, self.config.rollout.num_steps)
         given = start.frames, start.actions, start.text
         videos = continue_videos(self.folder.network, *given, lengths, frames, noise, settings)
         return clip_condition(videos, start.actions, start.text, lengths).repeat_interleave(request.group_size)
-
-    def evaluate(self, contexts: Clips, num_steps: int) -> Tensor:
-        """Sample one clip of each context by ODE and decode it: uint8 (E, F, H, W, 3).
-
-        A model that goes on from its own frames makes it clip after clip.
-        """
-        generator = ClipGenerator(self.folder, contexts, self.config)
-        rows, network = torch.arange(len(contexts)), self.folder.network
-        condition, settings = generator._condition(rows), self._ode(num_steps)
-        shape = generator._shape(contexts.frames.shape[1])
-
-        def noise(clip: int, shape: tuple[int, ...]) -> Tensor:
-            seeds = _seeds(self.config.seed, "clip_evaluation", clip, rows, torch.zeros_like(rows))
-            return initial_noise(shape, seeds).to(self.folder.device)
-
-        lengths = self.folder.lengths or ClipLengths(condition.num_conditioning, shape[1] - condition.num_conditioning)
-        given = condition.frames, condition.actions, condition.text
-        return self.folder.codec.decode(continue_videos(network, *given, lengths, shape[1], noise, settings))
 
     def references(self, request: GroupRequest) -> Clips:
         """Return the recordings that the request's clips are scored against, one row per clip, of the same frames."""
@@ -177,20 +159,6 @@ class ClipGenerator:
         lengths = self._lengths()
         first, given = lengths.place(self._made(request.history))
         return recorded.window(first, given + lengths.new)
-
-    def _condition(self, rows: Tensor) -> Condition:
-        condition = self.contexts.select(rows).condition(
-            self.folder.codec, self.folder.clip["num_conditioning"], self.folder.network.settings.text_dim
-        )
-        return condition.without_actions() if self.config.groups.hide_actions else condition
-
-    def _shape(self, frames: int) -> tuple[int, ...]:
-        _, _, H, W, _ = self.contexts.frames.shape
-        codec = self.folder.codec
-        return codec.channels, frames, H // codec.patch, W // codec.patch
-
-    def _ode(self, num_steps: int) -> RolloutConfig:
-        return self.config.rollout.with_values(num_steps=num_steps, buffer_device="model")
 
     def _made(self, history: int) -> int:
         """Frames of so many clips, the recorded first ones among them."""
@@ -223,19 +191,52 @@ class RecordedContexts(ClipGenerator):
 
     Args:
         probe: reads positions off the clips.
+
+    Raises:
+        ValueError: as ClipGenerator, or load_execution_reward.
     """
 
     def __init__(self, folder: VideoFolder, contexts: Clips, config: VideoRlConfig, probe: PositionProbe) -> None:
         super().__init__(folder, contexts, config)
-        self.probe = probe
+        self.probe, self.execution = probe, load_execution_reward(config, folder, contexts, probe)
 
     def score(self, request: GroupRequest, clips: RolloutBuffer) -> RolloutBuffer:
         """Return the buffer with every score of its clips and the training reward `total`, mixed by config.rewards."""
         frames = self.folder.codec.decode(clips.rollout.latents)
-        given = clips.condition.num_conditioning
-        rewards = self.config.rewards
-        scores = all_scores(frames, self.references(request), self.probe, self.folder.codec, given, rewards)
-        return attach_rewards(clips, scores, mix_rewards(scores, rewards))
+        scores = self.scores(request, frames, clips.condition.num_conditioning)
+        return attach_rewards(clips, scores, mix_rewards(scores, self.config.rewards))
+
+    def scores(self, request: GroupRequest, frames: Tensor, num_conditioning: int) -> dict[str, Tensor]:
+        """Return all_scores of the request's decoded clips, uint8 (N, F, H, W, 3)."""
+        references, codec, rewards = self.references(request), self.folder.codec, self.config.rewards
+        return all_scores(frames, references, self.probe, codec, num_conditioning, rewards, self.execution)
+
+
+def sample_by_ode(folder: VideoFolder, contexts: Clips, config: VideoRlConfig, num_steps: int) -> Tensor:
+    """Sample one clip of each context and decode it: uint8 (E, F, H, W, 3).
+
+    A model that goes on from its own frames makes it clip after clip.
+    """
+    rows, condition = torch.arange(len(contexts)), _condition(folder, contexts, config)
+
+    def noise(clip: int, shape: tuple[int, ...]) -> Tensor:
+        seeds = _seeds(config.seed, "clip_evaluation", clip, rows, torch.zeros_like(rows))
+        return initial_noise(shape, seeds).to(folder.device)
+
+    K, count = condition.num_conditioning, contexts.frames.shape[1]
+    lengths, given = folder.lengths or ClipLengths(K, count - K), (condition.frames, condition.actions, condition.text)
+    videos = continue_videos(folder.network, *given, lengths, count, noise, _ode(config, num_steps))
+    return folder.codec.decode(videos)
+
+
+def _condition(folder: VideoFolder, contexts: Clips, config: VideoRlConfig) -> Condition:
+    text_dim = folder.network.settings.text_dim
+    condition = contexts.condition(folder.codec, folder.clip["num_conditioning"], text_dim)
+    return condition.without_actions() if config.groups.hide_actions else condition
+
+
+def _ode(config: VideoRlConfig, num_steps: int) -> RolloutConfig:
+    return config.rollout.with_values(num_steps=num_steps, buffer_device="model")
 
 
 def _seeds(seed: int, name: str, iteration: int, group: Tensor, sample: Tensor) -> Tensor:

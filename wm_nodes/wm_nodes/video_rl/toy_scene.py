@@ -31,7 +31,6 @@ from wm_nodes.video_rl.sampling import sample_buffer
 
 CHANNELS, FRAMES, SIDE = 2, 6, 16
 NUM_ACTIONS = 4
-OBEDIENCE = 0.4
 RADIUS = 1.7
 DIRECTIONS = torch.tensor([[0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]])
 """(row, column) of actions 0 to 3: right, left, down, up."""
@@ -132,15 +131,6 @@ def draw_scenes(count: int, seed: int, name: str, index: int = 0, side: int = SI
     )
 
 
-def training_batch(count: int, seed: int, iteration: int) -> tuple[Tensor, Condition]:
-    """Videos (B, C, F, H, W) in which the action is obeyed with probability OBEDIENCE, and their condition."""
-    scenes = draw_scenes(count, seed, "training", iteration)
-    generator = torch_stream(seed, "moving_disc_obedience", iteration)
-    obeys = torch.rand(count, generator=generator) < OBEDIENCE
-    direction = torch.where(obeys, scenes.action, torch.randint(NUM_ACTIONS, (count,), generator=generator))
-    return scenes.videos(direction), scenes.condition()
-
-
 def score(videos: Tensor, scenes: Scenes) -> Scores:
     """Score videos (B, C, F, H, W) of the scenes, from their pixels and the known background, where the videos are."""
     scenes = scenes.to(videos.device)
@@ -234,12 +224,6 @@ class ToyContexts:
     def _seeds(self, name: str, iteration: int, numbers: Tensor) -> Tensor:
         seeds = (stream_seed(self.config.seed, f"moving_disc_{name}", iteration, int(number)) for number in numbers)
         return torch.tensor([seed % MAX_SEED for seed in seeds])
-
-
-def centred_pixels(videos: Tensor) -> Tensor:
-    """Features of generated frames, (n, F - 1, C H W): pixels less their frame's mean, so that motion shows."""
-    frames = videos[:, :, 1:].transpose(1, 2)
-    return (frames - frames.mean((3, 4), keepdim=True)).flatten(2)
 
 
 def opacity_at(centres: Tensor, radius: float = RADIUS, side: int = SIDE) -> Tensor:

@@ -1,11 +1,6 @@
 """A run folder of loop 2: the learner with its versions, checkpoint and metrics, resumed where it stopped.
 
-versions: run_dir/video_policies/video_<optimizer steps>.safetensors; version 0 is the model's own folder. With
-grpo.ema_decay > 0, averaged_<optimizer steps>.safetensors beside each: the weights that are evaluated.
-
-Staleness: by default buffer i is sampled by the version that trains on it. Where grpo.max_staleness covers the
-optimizer steps of one buffer it may be sampled while the learner trains on buffer i - 1, so by the version before.
-sampling_version follows from the run folder alone, so a resumed run uses the versions of one that was not stopped.
+versions: run_dir/video_policies/video_<optimizer steps>.safetensors; version 0 is the model's own folder.
 """
 
 import json
@@ -28,12 +23,7 @@ from wm_nodes.video_rl.reward_hacking import HackedMetric
 from wm_nodes.video_rl.validation import SECTION, HeldoutScores, alarm_scalars, find_hacked_now
 
 CHECKPOINT = "checkpoints/video_learner.safetensors"
-VIDEO_FILES, AVERAGED_FILES = VersionFiles("video_policies/video"), VersionFiles("video_policies/averaged")
-
-
-def evaluated_uri(version: int, config: VideoRlConfig) -> str:
-    """Return the file name of the weights of a version that are evaluated: the averaged ones where there are any."""
-    return (AVERAGED_FILES if config.grpo.ema_decay > 0 else VIDEO_FILES).uri(version)
+VIDEO_FILES = VersionFiles("video_policies/video")
 
 
 def progress(run_dir: Path) -> tuple[int, int]:
@@ -58,7 +48,7 @@ class VideoRun(TrainingRun):
     Args:
         keep_versions: files kept in run_dir/video_policies, at least 2.
         heldout: scores of held-out contexts by the network's weights, asked for by rank 0 after every
-            `evaluation.every`-th buffer while the network has its averaged weights; None: never.
+            `evaluation.every`-th buffer; None: never.
     """
 
     files, checkpoint = VIDEO_FILES, CHECKPOINT
@@ -70,18 +60,9 @@ class VideoRun(TrainingRun):
         super().__init__(run_dir, keep_versions, ranks)
         self.network, self.config, self._heldout = network, config, heldout
         self._training = threading.Lock()
-        self.learner = GrpoLearner(
-            network, config.grpo, config.rollout, seed=config.seed, ranks=ranks
-        )
-        self.iterations = 0
-        """Buffers trained on in the run folder."""
+        self.learner = GrpoLearner(network, config.grpo, config.rollout, seed=config.seed, ranks=ranks)
         if (run_dir / CHECKPOINT).is_file():
-            self.iterations = self.learner.load(run_dir / CHECKPOINT)
-        older = [] if self.learner.skipped else [v for v in self.files.versions(run_dir) if v < self.version]
-        self.previous_version = max(older, default=self.version)
-        """The version before the last buffer; that of now before any, and after one that was skipped."""
-        self.staleness = 0
-        """Optimizer steps between sampling and training of the last buffer."""
+            self.learner.load(run_dir / CHECKPOINT)
         self._metrics = MetricsWriter(run_dir, tensorboard=tensorboard) if self.ranks.rank == 0 else None
         self.check: Callable[[], None] = lambda: None
         """Called before every call of the network; what it raises ends the training with nothing changed. With several
@@ -94,18 +75,13 @@ class VideoRun(TrainingRun):
         return self.learner.version
 
     @property
+    def iterations(self) -> int:
+        """Buffers trained on in the run folder."""
+        return self.learner.iterations
+
+    @property
     def updates(self) -> int:
         return self.iterations
-
-    @property
-    def prefetches(self) -> bool:
-        """Whether the next buffer may be sampled while this one is trained on."""
-        return self.config.grpo.max_staleness >= self.config.grpo.updates_per_buffer
-
-    @property
-    def sampling_version(self) -> int:
-        """The version that samples the next buffer, number `iterations`."""
-        return self.previous_version if self.prefetches else self.version
 
     def train(self, buffer: RolloutBuffer) -> BufferReport:
         """Train on one buffer with rewards, or skip it (see GrpoLearner.train), then save.
@@ -116,18 +92,15 @@ class VideoRun(TrainingRun):
         with self._training:
             if self.ranks.size > 1 and self.ranks.rank == 0:
                 broadcast_bytes(buffer.to_bytes(), self.ranks)
-            before, self.staleness = self.version, self.version - buffer.policy_version
             stops = self.network.register_forward_pre_hook(lambda *_: self.check() if self.ranks.size == 1 else None)
             device, micro_batch = device_of(self.network), self.config.grpo.micro_batch
             with stops, explain_memory(device, grpo__micro_batch=micro_batch):
                 if self.config.rollout.buffer_device == "model":
                     buffer = buffer.to(device)
                 report = self.learner.train(buffer)
-            self.iterations += 1
-            self.previous_version = before
             if self._metrics is not None:
                 self.save()
-                self._metrics.write("grpo", self.iterations, {**flatten_metrics(report), "staleness": self.staleness})
+                self._metrics.write("grpo", self.iterations, flatten_metrics(report))
                 self._watch(self._metrics)
             return report
 
@@ -138,12 +111,7 @@ class VideoRun(TrainingRun):
 
     def write_files(self) -> PackedWeights:
         packed = save_weights(self.network, self.run_dir / self.files.uri(self.version), {"version": str(self.version)})
-        if self.learner.averaged:
-            with self.learner.averaged_weights():
-                path = self.run_dir / AVERAGED_FILES.uri(self.version)
-                save_weights(self.network, path, {"version": f"{self.version}, averaged"})
-        self.learner.save(self.run_dir / CHECKPOINT, iteration=self.iterations)
-        AVERAGED_FILES.prune(self.run_dir, self._keep_versions, self.version)
+        self.learner.save(self.run_dir / CHECKPOINT)
         return packed
 
     def close(self) -> None:
@@ -157,8 +125,7 @@ class VideoRun(TrainingRun):
         every = self.config.evaluation.every
         if self._heldout is None or not every or self.iterations % every:
             return
-        with self.learner.averaged_weights():
-            scores = self._heldout()
+        scores = self._heldout()
         lines = [*read_metrics(self.run_dir), {"section": SECTION, "step": self.iterations, **scores}]
         alarms = find_hacked_now(lines, self.config.evaluation.window)
         self.hacked = alarms or []

@@ -6,6 +6,7 @@ Shapes: E contexts.
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from wm_nodes.core.model_folder import AGAIN, read_json
 from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder
+from wm_nodes.video_rl.execution_reward import EXECUTION_SCORES, load_execution_reward
 from wm_nodes.video_rl.reference_reward import (
     PICTURE_SCORES,
     ClipScores,
@@ -26,13 +28,13 @@ from wm_nodes.video_rl.reference_reward import (
     more_is_better,
 )
 from wm_nodes.video_rl.reward_hacking import HackedMetric, find_hacked_metrics
-from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.sampling import sample_by_ode
 from wm_nodes.world_model.position_probe import PositionProbe
 
 SECTION = "heldout"
 """Of metrics.jsonl: scores by name, mean over the contexts, at the number of buffers trained on."""
 WATCHED = (*ClipScores.__dataclass_fields__, *PICTURE_SCORES)
-OUTCOMES = ("success", "outcome")
+OUTCOMES = ("success", "outcome", *EXECUTION_SCORES)
 
 HeldoutScores = Callable[[], Mapping[str, float]]
 """The held-out scores of a network's weights at the moment of the call."""
@@ -47,9 +49,12 @@ def context_scores(
     """
     contexts = evaluated_contexts(heldout, config)
     folder.network.eval()
-    frames = ClipGenerator(folder, contexts, config).evaluate(contexts, config.evaluation.num_steps)
-    scores = all_scores(frames, contexts, probe, folder.codec, folder.clip["num_conditioning"], config.rewards)
-    return {name: scores[name] for name in OUTCOMES} if config.groups.hide_actions else scores
+    frames = sample_by_ode(folder, contexts, config, config.evaluation.num_steps)
+    scores = all_scores(
+        frames, contexts, probe, folder.codec, folder.clip["num_conditioning"], config.rewards,
+        load_execution_reward(config, folder, contexts, probe),
+    )
+    return {name: scores[name] for name in OUTCOMES if name in scores} if config.groups.hide_actions else scores
 
 
 def evaluated_contexts(heldout: Clips, config: VideoRlConfig) -> Clips:
@@ -61,12 +66,19 @@ def load_or_measure_scores(
     path: Path, folder: VideoFolder, heldout: Clips, probe: PositionProbe, config: VideoRlConfig
 ) -> dict[str, list[float]]:
     """Return context_scores(): read from `path` where they are of the same weights, else measured and written there."""
-    sha256 = pack_weights(folder.network).sha256
-    if path.is_file() and (saved := read_json(path, AGAIN))["sha256"] == sha256:
-        return dict(saved["scores"])
-    scores = {name: values.tolist() for name, values in context_scores(folder, heldout, probe, config).items()}
-    write_atomic(path, json.dumps({"sha256": sha256, "scores": scores}).encode())
-    return scores
+    def measure() -> dict[str, list[float]]:
+        return {name: values.tolist() for name, values in context_scores(folder, heldout, probe, config).items()}
+
+    return measured_once(path, {"sha256": pack_weights(folder.network).sha256}, measure)
+
+
+def measured_once(path: Path, of: Mapping[str, Any], measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return what `measure` finds, as JSON: read from `path` where that is `of` the same, else written there."""
+    if path.is_file() and (saved := read_json(path, AGAIN)).get("of") == of:
+        return dict(saved["found"])
+    found = measure()
+    write_atomic(path, json.dumps({"of": of, "found": found}).encode())
+    return found
 
 
 def validation_scores(
@@ -89,16 +101,16 @@ def validation_scores(
     return scores
 
 
-def find_hacked_now(lines: Sequence[Mapping[str, object]], window: int) -> list[HackedMetric] | None:
+def find_hacked_now(lines: Sequence[Mapping[str, Any]], window: int) -> list[HackedMetric] | None:
     """Return the metrics that fell over the newest `window` evaluations in lines of metrics.jsonl while the training
     reward rose (DD-2), None while there are fewer evaluations. The reward of an evaluation is the mean of the buffers
     since the one before; slopes are per evaluation, of more_is_better(). Only WATCHED scores are compared.
     """
-    rewards = {_step(line): line["reward_mean"] for line in lines if line["section"] == "grpo"}
-    evaluations = {_step(line): line for line in lines if line["section"] == SECTION}
-    proxy, rows, begin = list[float](), list[Mapping[str, object]](), 0
+    rewards = {line["step"]: line["reward_mean"] for line in lines if line["section"] == "grpo"}
+    evaluations = {line["step"]: line for line in lines if line["section"] == SECTION}
+    proxy, rows, begin = list[float](), list[Mapping[str, Any]](), 0
     for step in sorted(evaluations):
-        since = [float(str(value)) for at, value in rewards.items() if begin < at <= step and value is not None]
+        since = [value for at, value in rewards.items() if begin < at <= step and value is not None]
         begin = step
         if since:
             proxy.append(sum(since) / len(since))
@@ -106,7 +118,7 @@ def find_hacked_now(lines: Sequence[Mapping[str, object]], window: int) -> list[
     if len(proxy) < window:
         return None
     names = [name for name in WATCHED if all(row.get(name) is not None for row in rows)]
-    curves = {name: [float(more_is_better(name, float(str(row[name])))) for row in rows] for name in names}
+    curves = {name: more_is_better(name, [row[name] for row in rows]).tolist() for name in names}
     return find_hacked_metrics(proxy, curves, window=window)
 
 
@@ -120,12 +132,10 @@ def alarm_scalars(alarms: Sequence[HackedMetric] | None) -> dict[str, float]:
     return scalars
 
 
-def alarms_of(line: Mapping[str, object]) -> list[HackedMetric]:
+def alarms_of(line: Mapping[str, Any]) -> list[HackedMetric]:
     """Read the alarms in a line of metrics.jsonl."""
-    return [
-        HackedMetric(name, float(str(line["reward_slope"])), float(str(line[f"hacked_{name}"])))
-        for name in WATCHED if line.get(f"hacked_{name}") is not None
-    ]
+    slopes = {name: line.get(f"hacked_{name}") for name in WATCHED}
+    return [HackedMetric(name, line["reward_slope"], slope) for name, slope in slopes.items() if slope is not None]
 
 
 def alarm_text(alarms: Sequence[HackedMetric]) -> str:
@@ -137,7 +147,3 @@ def alarm_text(alarms: Sequence[HackedMetric]) -> str:
         f"the training reward rises by {alarms[0].proxy_slope:.3g} per evaluation while held-out scores get worse: "
         f"{worse}; weigh them in, or stop earlier"
     )
-
-
-def _step(line: Mapping[str, object]) -> int:
-    return int(str(line["step"]))

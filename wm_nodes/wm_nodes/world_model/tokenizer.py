@@ -39,6 +39,14 @@ class ResidualConv(nn.Module):
         return x + change
 
 
+def make_probe(features: int, config: TokenizerConfig, values: int) -> nn.Sequential:
+    """What reads `values` numbers off the flattened latents of a frame."""
+    layers: list[nn.Module] = [nn.Linear(features, 256), nn.SiLU()]
+    for _ in range(config.probe_depth - 1):
+        layers += [nn.Linear(256, 256), nn.SiLU()]
+    return nn.Sequential(*layers, nn.Linear(256, values))
+
+
 class Tokenizer(nn.Module):
     """Convolutional encoder and decoder around `latent_dim` values per token, and a probe that reads num_positions
     values off them; none where they are 0.
@@ -80,12 +88,7 @@ class Tokenizer(nn.Module):
             up += [nn.Conv2d(previous, 4 * current, 1), nn.PixelShuffle(2), nn.SiLU(), ResidualConv(current)]
         self.decoder = nn.Sequential(*up, nn.Conv2d(channels[0], 48, 3, padding=1), nn.PixelShuffle(4))
         self.num_positions = num_positions
-        self.probe: nn.Sequential | None = None
-        if num_positions:
-            probe: list[nn.Module] = [nn.Linear(self.num_tokens * config.latent_dim, 256), nn.SiLU()]
-            for _ in range(config.probe_depth - 1):
-                probe += [nn.Linear(256, 256), nn.SiLU()]
-            self.probe = nn.Sequential(*probe, nn.Linear(256, num_positions))
+        self.probe = make_probe(self.num_tokens * config.latent_dim, config, num_positions) if num_positions else None
         self.background: Tensor
         self.probe_mean: Tensor
         self.probe_std: Tensor

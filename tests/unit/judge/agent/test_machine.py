@@ -32,7 +32,6 @@ from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.types import ClipRef, Profile, Stage, Status
 from wm_nodes.judge.agent.verdict import Verdict
-from wm_nodes.video_rl.group_advantages import trainable
 
 QUIET = {"voting": {"audit_share": 0.0}, "reflection": {"audit_share": 0.0}}
 RUBRIC = load_rubric(overrides=QUIET)
@@ -407,15 +406,6 @@ def test_clips_judged_at_the_same_time_get_the_verdicts_they_get_alone() -> None
 
     alone = [asyncio.run(agent.evaluate(clip, make_task(clip))).audit_id for clip in clips]
     assert [verdict.audit_id for verdict in asyncio.run(together())] == alone and len(set(alone)) == 6
-
-
-def test_a_group_with_too_few_valid_clips_does_not_train() -> None:
-    valid = np.array([1, 1, 0, 0, 1, 0, 0, 0, 1, 0, 1], bool)
-    groups = np.array([0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 3])
-    assert trainable(valid, groups).tolist() == [True, True] + [False] * 9
-    assert trainable(np.array([1, 1], bool), np.array([5, 5])).all()
-    two_of_six = np.array([1, 1, 0, 0, 0, 0], bool)
-    assert not trainable(two_of_six, np.zeros(6, int)).any()
 
 
 def test_a_round_with_more_than_a_tenth_invalid_pauses_and_says_why() -> None:

@@ -69,32 +69,26 @@ class TrainingNode(ManagedNode):
     def deactivate(self, reason: str) -> None:
         self._action.stop(reason)
 
-    def announce(self, version: int | None = None) -> None:
-        """Publish a version, by default the newest; its files are written first. Raises OSError."""
+    def announce(self) -> None:
+        """Publish the newest version; its files are written first. Raises OSError."""
         run = self._run
         assert run is not None  # serve_training sets it
         run.ensure_saved()
-        newest = run.version
-        version = newest if version is None else version
-        packed = run.weights_of(version)
+        packed = run.weights_of(run.version)
         message = PolicyVersion(
-            version=version, train_step=run.updates - (version != newest), uri=run.files.uri(version),
-            sha256=packed.sha256, size_bytes=len(packed.data), format="safetensors", arch_hash=packed.arch_hash,
+            version=run.version, train_step=run.updates, uri=run.files.uri(run.version), sha256=packed.sha256,
+            size_bytes=len(packed.data), format="safetensors", arch_hash=packed.arch_hash,
         )
         message.header.stamp = self.get_clock().now().to_msg()
         if len(packed.data) <= self.inline_limit_bytes:
             message.inline_data = convert.bytes_field(packed.data)
         self._versions.publish(message)
 
-    def announce_versions(self) -> None:
-        """Publish every version that is acted with now. Raises OSError."""
-        self.announce()
-
     def _train_goal(self, work: Work, result: Any) -> None:
         reasons, run = type(result), self._run
         assert run is not None  # serve_training sets it
         try:
-            self.announce_versions()  # again: others may have heard of another one since, or its files were not written
+            self.announce()  # again: others may have heard of another one since, or its files were not written
             self.train(work, result)
         except PeerLost as error:
             result.termination_reason, result.message = reasons.PEER_LOST, str(error)

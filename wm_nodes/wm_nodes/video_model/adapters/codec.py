@@ -56,19 +56,6 @@ class VideoCodec:
 
         return self._one_by_one(part, latents)
 
-    @torch.no_grad()
-    def continuation(self, latents: Tensor, num_frames: int) -> Tensor:
-        """Return the latents of given frames followed by grey ones: the image condition of Wan's I2V.
-
-        Their first frames are exactly those given; the rest is encoded from the frames as the VAE decodes them.
-        """
-        N = 1 + (num_frames - 1) * self.frames_per_latent
-        with self._present():
-            pixels = self._decode(latents)
-            grey = pixels.new_zeros((*pixels.shape[:2], N - pixels.shape[2], *pixels.shape[3:]))
-            rest = self._encode(torch.cat([pixels, grey], 2))
-        return torch.cat([latents.to(rest), rest[:, :, latents.shape[2] :]], 2)
-
     def _one_by_one(self, function: Callable[[Tensor], Tensor], clips: Tensor) -> Tensor:
         """The results of one clip at a time, since the VAE's memory grows with them."""
         with self._present():

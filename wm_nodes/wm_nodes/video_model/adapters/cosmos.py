@@ -1,49 +1,33 @@
-"""Cosmos-Predict2 and Cosmos-Predict2.5 (base models) behind VelocityModel.
+"""Cosmos-Predict2.5 (base models) behind VelocityModel.
 
 Shapes: B batch, C channels, F latent frames, K given frames, H W latent grid, E text values.
 
-Predict2.5 is trained on x = (1 - t) x_0 + t eps, is told t itself (no factor 1000) and returns eps - x_0: our v.
-Predict2 is written as a denoiser of L = x_0 + sigma eps, with t = sigma / (1 + sigma):
-
-    c_in = c_skip = 1 - t, c_out = -t:   x_0 = (1 - t) L - t network((1 - t) L, t).
-
-Since (1 - t) L = (1 - t) x_0 + t eps is our x_t, the network again sees x_t and returns (x_t - x_0) / t = v. Its
-training ends at sigma = 80, t = 0.988; Predict2.5's sampler starts at 0.995. Our samplers start at t = 1.
+It is trained on x = (1 - t) x_0 + t eps, is told t itself (no factor 1000) and returns eps - x_0: our v. Its sampler
+starts at t = 0.995, ours at 1.
 Given frames are clean latents in place, marked in a mask channel and given a time near 0 (CLEAN_TIME).
 """
 
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from wm_nodes.video_model.adapters.velocity import CfgConvention, PublicVelocity
+from wm_nodes.video_model.adapters.velocity import PublicVelocity
 from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.kernels import with_conditioning
 
-CosmosVersion = Literal["2", "2.5"]
-CLEAN_TIME: dict[str, float] = {"2": 1e-4 / (1 + 1e-4), "2.5": 1e-4}
-"""Time of given frames: the pipelines' sigma_conditioning as a t, and conditional_frame_timestep."""
+CLEAN_TIME = 1e-4
+"""Of given frames: the pipeline's conditional_frame_timestep."""
 
 
 class CosmosVelocity(PublicVelocity):
-    """CosmosTransformer3DModel.
+    """CosmosTransformer3DModel. Our rollout.cfg is 1 + the guidance scale of its card: v_c + scale (v_c - v_u)."""
 
-    Args:
-        fps: camera frames per second for the position embedding; None (2.5's pipeline): none.
-    """
-
-    cfg_convention: ClassVar[CfgConvention] = "conditional"
-
-    def __init__(
-        self, transformer: nn.Module, null_text: Tensor | None = None, *, version: CosmosVersion = "2.5",
-        fps: int | None = None,
-    ) -> None:
+    def __init__(self, transformer: nn.Module, null_text: Tensor | None = None) -> None:
         config: Any = transformer.config
         super().__init__(transformer, null_text)
         if config.img_context_dim_in:
             raise ValueError("this Cosmos model wants image context (Transfer2.5), which is not supported")
-        self.version, self.fps = version, fps
         self.patch: tuple[int, int, int] = tuple(config.patch_size)
         self.channels = int(config.out_channels)
         self.has_mask = int(config.in_channels) == self.channels + 1
@@ -64,13 +48,12 @@ class CosmosVelocity(PublicVelocity):
         K, dtype = condition.num_conditioning, self.transformer.patch_embed.proj.weight.dtype
         if K and not self.has_mask:
             raise ValueError(f"this Cosmos model has no mask channel and takes no given frames, got {K}")
-        times = self._frame_times(t, x, K, CLEAN_TIME[self.version])
+        times = self._frame_times(t, x, K, CLEAN_TIME)
         text = self._text(condition, drop, dtype)
         out = self.transformer(
             hidden_states=with_conditioning(x, condition.frames).to(dtype),
-            timestep=times.to(dtype if self.version == "2" else torch.float32)[:, None, :, None, None],
-            encoder_hidden_states=text, condition_mask=self._extra_channels(x, K, dtype), fps=self.fps,
-            return_dict=False,
+            timestep=times.float()[:, None, :, None, None], encoder_hidden_states=text,
+            condition_mask=self._extra_channels(x, K, dtype), fps=None, return_dict=False,
         )[0]
         velocity: Tensor = out.float()
         return velocity

@@ -14,7 +14,7 @@ from wm_nodes.core.model_folder import ModelFolderError, read_json
 from wm_nodes.video_model.adapters.packages import package
 
 REMEDY = "download the whole model again in its diffusers layout (with safetensors), and name that folder"
-TEXT_ENCODERS = ("UMT5EncoderModel", "T5EncoderModel", "Qwen2_5_VLForConditionalGeneration")
+TEXT_ENCODERS = ("UMT5EncoderModel", "Qwen2_5_VLForConditionalGeneration")
 
 
 class ModelFolder:

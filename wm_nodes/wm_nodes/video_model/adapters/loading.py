@@ -10,18 +10,17 @@ from torch import Tensor
 from wm_nodes.core.device import device_of
 from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.video_model.adapters.codec import VideoCodec
-from wm_nodes.video_model.adapters.cosmos import CosmosVelocity, CosmosVersion
+from wm_nodes.video_model.adapters.cosmos import CosmosVelocity
 from wm_nodes.video_model.adapters.folder import ModelFolder
 from wm_nodes.video_model.adapters.packages import package
-from wm_nodes.video_model.adapters.text import MAX_TOKENS, TextEncoder, TextStyle
+from wm_nodes.video_model.adapters.text import MAX_TOKENS, TextEncoder
 from wm_nodes.video_model.adapters.velocity import PublicVelocity
-from wm_nodes.video_model.adapters.wan import GivenFrames, WanVelocity
+from wm_nodes.video_model.adapters.wan import WanVelocity
 from wm_nodes.video_model.conditions import Condition
 
 Precision = Literal["float32", "bfloat16", "float16"]
 WAN = ("WanPipeline", "WanImageToVideoPipeline")
-COSMOS: dict[str, CosmosVersion] = {"Cosmos2VideoToWorldPipeline": "2", "Cosmos2_5_PredictBasePipeline": "2.5"}
-COSMOS2_FPS = 16
+COSMOS = "Cosmos2_5_PredictBasePipeline"
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ class PublicVideoModel:
 
 
 def load_public_model(folder: Path | str, settings: LoadSettings | None = None) -> PublicVideoModel:
-    """Load a Wan or Cosmos-Predict folder; nothing is fetched and nothing in it is executed.
+    """Load a Wan or Cosmos-Predict2.5 folder; nothing is fetched and nothing in it is executed.
 
     Raises:
         ModelFolderError: the folder is missing, incomplete or of another kind; names the path and the remedy.
@@ -82,19 +81,31 @@ def load_public_model(folder: Path | str, settings: LoadSettings | None = None) 
     settings = settings or LoadSettings()
     package("diffusers"), package("transformers")
     files = ModelFolder(folder)
-    if files.pipeline not in (*WAN, *COSMOS):
-        raise ModelFolderError(f"{files.folder} holds a {files.pipeline}; supported are {', '.join((*WAN, *COSMOS))}")
+    if files.pipeline not in (*WAN, COSMOS):
+        raise ModelFolderError(f"{files.folder} holds a {files.pipeline}; supported are {', '.join((*WAN, COSMOS))}")
+    if files.has("transformer_2"):
+        raise ModelFolderError(
+            f"{files.folder} holds two experts (Wan 2.2 A14B), which are not supported; take Wan 2.1 or Wan 2.2 TI2V-5B"
+        )
     dtype = getattr(torch, settings.dtype)
     vae = files.model("vae", "AutoencoderKLWan", torch.float32)
     codec = VideoCodec(vae, device=settings.device, offload=settings.offload)
-    text = _text(files, settings, dtype)
+    text = TextEncoder(
+        files.text_encoder(dtype), files.tokenizer(), "cosmos2.5" if files.pipeline == COSMOS else "wan",
+        device=settings.device, offload=settings.offload, max_tokens=settings.max_tokens,
+    )
     null_text = text.encode([settings.negative_prompt])[0]
     scheduler = files.scheduler()
     try:
-        if files.pipeline in WAN:
-            velocity: PublicVelocity = _wan(files, settings, codec, null_text, scheduler)
+        velocity: PublicVelocity
+        if files.pipeline == COSMOS:
+            velocity = CosmosVelocity(files.model("transformer", "CosmosTransformer3DModel", dtype), null_text)
         else:
-            velocity = _cosmos(files, settings, null_text)
+            velocity = WanVelocity(
+                files.model("transformer", "WanTransformer3DModel", dtype), null_text,
+                fused=bool(files.index.get("expand_timesteps")),
+                time_scale=float(scheduler.get("num_train_timesteps", 1000)),
+            )
     except ModelFolderError:
         raise
     except ValueError as error:
@@ -103,41 +114,6 @@ def load_public_model(folder: Path | str, settings: LoadSettings | None = None) 
     if settings.gradient_checkpointing:
         velocity.enable_gradient_checkpointing()
     return PublicVideoModel(velocity, codec, text, _shift(scheduler))
-
-
-def _text(files: ModelFolder, settings: LoadSettings, dtype: torch.dtype) -> TextEncoder:
-    version = COSMOS.get(files.pipeline)
-    style: TextStyle = "wan" if version is None else "cosmos2" if version == "2" else "cosmos2.5"
-    return TextEncoder(
-        files.text_encoder(dtype), files.tokenizer(), style, device=settings.device, offload=settings.offload,
-        max_tokens=settings.max_tokens,
-    )
-
-
-def _wan(
-    files: ModelFolder, settings: LoadSettings, codec: VideoCodec, null_text: Tensor, scheduler: dict[str, Any]
-) -> WanVelocity:
-    dtype, name = getattr(torch, settings.dtype), "WanTransformer3DModel"
-    transformer = files.model("transformer", name, dtype)
-    frames: GivenFrames = "none"
-    if transformer.config.in_channels > transformer.config.out_channels:
-        frames = "channels"
-    elif files.index.get("expand_timesteps"):
-        frames = "fused"
-    boundary = files.index.get("boundary_ratio")
-    low_noise = files.model("transformer_2", name, dtype) if boundary is not None else None
-    return WanVelocity(
-        transformer, null_text, frames=frames, continuation=codec.continuation, low_noise=low_noise,
-        boundary=float(boundary or 0.0), time_scale=float(scheduler.get("num_train_timesteps", 1000)),
-    )
-
-
-def _cosmos(files: ModelFolder, settings: LoadSettings, null_text: Tensor) -> CosmosVelocity:
-    version = COSMOS[files.pipeline]
-    return CosmosVelocity(
-        files.model("transformer", "CosmosTransformer3DModel", getattr(torch, settings.dtype)), null_text,
-        version=version, fps=COSMOS2_FPS if version == "2" else None,
-    )
 
 
 def _shift(scheduler: dict[str, Any]) -> float:

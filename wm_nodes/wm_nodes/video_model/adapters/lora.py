@@ -13,9 +13,7 @@ TARGETS = ("to_q", "to_k", "to_v", "to_out.0")
 """Attention projections of Wan's and Cosmos's blocks."""
 
 
-def add_lora(
-    model: PublicVelocity, rank: int, alpha: float | None = None, *, targets: tuple[str, ...] = TARGETS, seed: int = 0
-) -> None:
+def add_lora(model: PublicVelocity, rank: int, alpha: float | None = None, *, seed: int = 0) -> None:
     """Add an adapter in place, which starts as no change; it alone trains afterwards, in float32.
 
     Args:
@@ -27,13 +25,12 @@ def add_lora(
     if tuner_layers(model):
         raise ValueError("this model has a LoRA adapter already")
     config = package("peft").LoraConfig(
-        r=rank, lora_alpha=rank if alpha is None else alpha, target_modules=list(targets), lora_dropout=0.0
+        r=rank, lora_alpha=rank if alpha is None else alpha, target_modules=list(TARGETS), lora_dropout=0.0
     )
     model.requires_grad_(False)
     with torch.random.fork_rng(devices=[]):  # the weights are drawn on the CPU, then moved
         torch.manual_seed(seed)
-        for transformer in model.transformers():
-            transformer.add_adapter(config)
+        model.transformer.add_adapter(config)
     _train_adapter_alone(model)
 
 
@@ -41,8 +38,7 @@ def save_lora(model: PublicVelocity, folder: Path) -> None:
     """Write the adapter as safetensors that diffusers' pipelines load too (load_lora_adapter)."""
     if not tuner_layers(model):
         raise ValueError("this model has no LoRA adapter to save")
-    for name, transformer in zip(_names(model), model.transformers()):
-        transformer.save_lora_adapter(folder / name, safe_serialization=True)
+    model.transformer.save_lora_adapter(folder, safe_serialization=True)
 
 
 def load_lora(model: PublicVelocity, folder: Path) -> None:
@@ -53,21 +49,14 @@ def load_lora(model: PublicVelocity, folder: Path) -> None:
     """
     if tuner_layers(model):
         raise ValueError("this model has a LoRA adapter already")
-    missing = [name for name in _names(model) if not list((folder / name).glob("*.safetensors"))]
-    if missing:
-        raise ValueError(f"{folder / missing[0]} holds no LoRA adapter (*.safetensors); name a folder of save_lora")
+    if not list(folder.glob("*.safetensors")):
+        raise ValueError(f"{folder} holds no LoRA adapter (*.safetensors); name a folder of save_lora")
     model.requires_grad_(False)
-    for name, transformer in zip(_names(model), model.transformers()):
-        transformer.load_lora_adapter(
-            str(folder / name), prefix=None, adapter_name="default", use_safetensors=True, local_files_only=True
-        )
+    model.transformer.load_lora_adapter(
+        str(folder), prefix=None, adapter_name="default", use_safetensors=True, local_files_only=True
+    )
     _train_adapter_alone(model)
-    for name, transformer in zip(_names(model), model.transformers()):
-        _copy_exactly(transformer, folder / name)
-
-
-def _names(model: PublicVelocity) -> list[str]:
-    return [f"lora_{index}" for index in range(len(model.transformers()))]
+    _copy_exactly(model.transformer, folder)
 
 
 @torch.no_grad()

@@ -12,15 +12,15 @@ from torch import Tensor
 
 from wm_nodes.video_model.adapters.packages import package
 
-TextStyle = Literal["wan", "cosmos2", "cosmos2.5"]
+TextStyle = Literal["wan", "cosmos2.5"]
 MAX_TOKENS = 512
 
 
 class TextEncoder:
     """Text encoder and tokenizer of a folder. Texts are padded to `max_tokens`, because the models attend to padding.
 
-    style: wan and cosmos2 take the last layer of a T5, zero past the text's end; cosmos2.5 takes every layer of
-    Qwen2.5-VL, each token normalised, side by side (E = layers x width; see CosmosVelocity.project_text).
+    style: wan takes the last layer of a T5, zero past the text's end; cosmos2.5 takes every layer of Qwen2.5-VL, each
+    token normalised, side by side (E = layers x width; see CosmosVelocity.project_text).
     offload: the encoder rests on the CPU and visits the device for each call.
     """
 
@@ -45,10 +45,9 @@ class TextEncoder:
                 self.encoder.to("cpu")
 
     def _t5(self, prompts: list[str]) -> Tensor:
-        texts = [_clean(prompt) for prompt in prompts] if self.style == "wan" else prompts
         tokens = self.tokenizer(
-            texts, padding="max_length", max_length=self.max_tokens, truncation=True, return_attention_mask=True,
-            return_tensors="pt",
+            [_clean(prompt) for prompt in prompts], padding="max_length", max_length=self.max_tokens, truncation=True,
+            return_attention_mask=True, return_tensors="pt",
         )
         present = tokens.attention_mask.to(self.device)
         embedded: Tensor = self.encoder(tokens.input_ids.to(self.device), attention_mask=present).last_hidden_state

@@ -3,28 +3,15 @@
 Shapes: B batch, C channels, F latent frames, K given frames, H W latent grid, L text tokens of E values.
 """
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from wm_nodes.video_model.adapters.packages import package
 from wm_nodes.video_model.conditions import Condition
-
-CfgConvention = Literal["unconditional", "conditional"]
-
-
-def normalised_cfg(guidance_scale: float, convention: CfgConvention) -> float:
-    """Return our g of v_u + g (v_c - v_u) for a model card's scale.
-
-    convention: what the scaled difference is added to. `unconditional`: v_u + scale (v_c - v_u), off at 1 (Wan,
-    Cosmos text2world). `conditional`: v_c + scale (v_c - v_u), off at 0 (Cosmos-Predict2 and 2.5 in diffusers, which
-    also switch it off at any scale <= 1).
-    """
-    return guidance_scale if convention == "unconditional" else 1 + guidance_scale
 
 
 class PublicVelocity(nn.Module):
@@ -35,21 +22,11 @@ class PublicVelocity(nn.Module):
         null_text: embedded negative prompt (L, E), what a dropped row sees. None: dropping a row is refused.
     """
 
-    cfg_convention: ClassVar[CfgConvention]
-
     def __init__(self, transformer: nn.Module, null_text: Tensor | None) -> None:
         super().__init__()
         self.transformer: Any = transformer
         self.null_text: Tensor | None
         self.register_buffer("null_text", null_text, persistent=False)
-
-    def normalised_cfg(self, guidance_scale: float) -> float:
-        """Return RolloutConfig.cfg for the scale that this model's card gives."""
-        return normalised_cfg(guidance_scale, self.cfg_convention)
-
-    def transformers(self) -> list[Any]:
-        """Every network that samples, in order of falling noise."""
-        return [self.transformer]
 
     def project_text(self, text: Tensor) -> Tensor:
         """Return the text as a Condition should keep it, (B, L, E)."""
@@ -57,8 +34,7 @@ class PublicVelocity(nn.Module):
 
     def enable_gradient_checkpointing(self) -> None:
         """Trade a second forward pass for the activations' memory; same gradients."""
-        for transformer in self.transformers():
-            transformer.enable_gradient_checkpointing()
+        self.transformer.enable_gradient_checkpointing()
 
     @contextmanager
     def disable_adapter(self) -> Iterator[None]:
@@ -113,8 +89,3 @@ def tuner_layers(model: nn.Module) -> list[Any]:
         return []
     base = package("peft.tuners.tuners_utils").BaseTunerLayer
     return [module for module in model.modules() if isinstance(module, base)]
-
-
-def num_cells(x: Tensor, patch: tuple[int, int, int]) -> int:
-    """Tokens of one latent frame."""
-    return math.prod(size // side for size, side in zip(x.shape[3:], patch[1:]))

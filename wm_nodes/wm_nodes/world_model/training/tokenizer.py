@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from wm_nodes.config.schema import RunConfig, TokenizerConfig
@@ -18,13 +18,15 @@ from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.positions import probe_targets
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.quantizer import entropy_loss
-from wm_nodes.world_model.tokenizer import Tokenizer
+from wm_nodes.world_model.tokenizer import Tokenizer, make_probe
 
 LATENT_NOISE = 0.1
 """Standard deviation of the noise on continuous latents while training; their own is 1."""
 BACKGROUND_FRAMES = 256
 FOREGROUND_CONTRAST = 0.25
 """A pixel counts as fully foreground when a channel differs from the background by this much, of [0, 1]."""
+WORST_SHARE = 0.02
+"""Of a frame's pixels, those with the largest error: about what a small thing takes up."""
 SURROUNDINGS_PX = 15
 """About three times an object's width."""
 
@@ -35,8 +37,9 @@ def train_tokenizer(
     """Train on every recorded frame; returns the tokenizer (averaged weights) and its last metrics.
 
     Loss: L1 + 2 L2 on pixels, foreground weighed 1 + tokenizer.foreground_weight; a probe that reads object and tool
-    positions off the latents (its gradient reaches the encoder, so small objects stay encoded), where the episodes have
-    ground truth; for lfq the entropy and commitment terms.
+    positions off the latents, whose gradient reaches the encoder; for lfq the entropy and commitment terms. Where the
+    episodes have no ground truth, the probe reads recorded_targets instead and is not kept, and the worst pixels of
+    each frame count more (tokenizer.worst_weight): both keep small things encoded.
     """
     settings = config.tokenizer
     height, width = episodes.images.shape[2:4]
@@ -47,6 +50,15 @@ def train_tokenizer(
         codec = Tokenizer(settings, height, width, truth.shape[-1])
     _set_statistics(codec, images[frames], truth[frames], seed)
     codec.to(compute_device(config.device))
+    probe, has_truth = codec.probe, truth.shape[-1] > 0
+    trained: nn.Module = codec
+    if probe is None:
+        truth = recorded_targets(episodes).reshape(len(images), -1)
+        mean, std = position_statistics(truth[frames])
+        truth = (truth - mean) / std
+        with initial_weights(seed, "recorded_probe_init"):
+            probe = make_probe(codec.num_tokens * codec.latent_dim, settings, truth.shape[-1]).to(codec.device)
+        trained = nn.ModuleDict({"tokenizer": codec, "probe": probe})
 
     def read(iteration: int) -> tuple[Tensor, Tensor, Tensor]:
         rows = numpy_stream(seed, "tokenizer_batch", iteration).choice(frames, settings.batch_size)
@@ -64,12 +76,16 @@ def train_tokenizer(
             latents = codec.bottleneck(features)
             noisy = latents + LATENT_NOISE * noise if codec.kind == "continuous" else latents
             reconstruction = codec.decode_pixels(noisy)
-            probed = codec.read_state_normalised(noisy)
+            probed = probe(noisy.flatten(1)).float()
         error = reconstruction - pixels
         weight = foreground_weight(pixels, codec.background, settings)
-        terms = {"pixel": (weight * (error.abs() + 2 * error.square())).mean() / weight.mean()}
-        terms["probe"] = probe_loss(codec, probed, positions)
+        errors = error.abs() + 2 * error.square()
+        terms = {"pixel": (weight * errors).mean() / weight.mean()}
+        terms["probe"] = probe_loss(codec, probed, positions) if has_truth else known_huber(probed, positions)
         terms["loss"] = terms["pixel"] + settings.probe_weight * terms["probe"]
+        if not has_truth:
+            terms["worst"] = worst_error(errors)
+            terms["loss"] = terms["loss"] + settings.worst_weight * terms["worst"]
         if codec.kind == "lfq":
             terms["entropy"] = entropy_loss(features)
             terms["commitment"] = (features - latents.detach()).square().mean()
@@ -80,7 +96,7 @@ def train_tokenizer(
         terms["psnr_db"] = -10 * error.detach().square().mean().log10()
         return terms
 
-    loop = TrainingLoop("tokenizer", codec, settings.num_iterations, settings.learning_rate, run_dir)
+    loop = TrainingLoop("tokenizer", trained, settings.num_iterations, settings.learning_rate, run_dir)
     return codec, loop.run(loss)
 
 
@@ -93,6 +109,21 @@ def foreground_weight(pixels_B3HW: Tensor, median_3HW: Tensor, settings: Tokeniz
         background = F.avg_pool2d(pixels_B3HW, side, stride=1, padding=side // 2, count_include_pad=False)
     contrast = (pixels_B3HW - background).abs().amax(1, keepdim=True) / FOREGROUND_CONTRAST
     return 1 + settings.foreground_weight * contrast.clamp(max=1)
+
+
+def worst_error(errors_B3HW: Tensor) -> Tensor:
+    """Mean error of the WORST_SHARE of each frame's pixels with the largest ones."""
+    errors = errors_B3HW.mean(1).flatten(1)
+    return errors.topk(max(1, int(WORST_SHARE * errors.shape[1])), dim=1).values.mean()
+
+
+def recorded_targets(episodes: EpisodeArrays) -> FloatArray:
+    """What recordings say of each frame (E, T + 1, A + J) without ground truth: the action taken there, NaN after the
+    last step, and whether each task is done. Whoever acts towards a goal shows where it is."""
+    acted = np.where(episodes.step_mask[..., None], episodes.actions, np.nan)
+    acted = np.pad(acted, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+    targets: FloatArray = np.concatenate((acted, episodes.success), -1)
+    return targets.astype(np.float32, copy=False)
 
 
 def episode_targets(episodes: EpisodeArrays) -> FloatArray:

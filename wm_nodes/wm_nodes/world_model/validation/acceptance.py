@@ -23,7 +23,13 @@ from wm_nodes.world_model.positions import judged_things
 from wm_nodes.world_model.validation.acceptance_report import AcceptanceReport, Criterion, Outcome, at_step, number_of
 from wm_nodes.world_model.validation.goals import goal_metrics
 from wm_nodes.world_model.validation.open_loop import MOVED_M, evaluate_rollouts
-from wm_nodes.world_model.validation.pictures import horizons_of, judged_horizon, picture_metrics
+from wm_nodes.world_model.validation.pictures import (
+    ENOUGH,
+    horizons_of,
+    judged_horizon,
+    picture_metrics,
+    worst_varying_step,
+)
 
 MORE_TRAINING = (
     "train longer (world_model.num_iterations) or on more episodes near contact (data.num_episodes, data.behaviours)"
@@ -33,6 +39,7 @@ MORE_SUCCESSES = "collect more successes (data.behaviours), or lower reward.succ
 MORE_RECORDED = "train longer (tokenizer.num_iterations, world_model.num_iterations), or record more episodes"
 RECORDED_NEAR_MISSES = "record more episodes that nearly succeed, or raise reward.success_threshold"
 RECORDED_SUCCESSES = "record more episodes that succeed, or lower reward.success_threshold"
+LOST_THINGS = "train the tokenizer longer (tokenizer.num_iterations), or with smaller patches (tokenizer.patch_px)"
 OTHER_ACTIONS = "record episodes in which the robot does different things from alike first frames, or train longer"
 POLICY_DATA = "refresh the model with more episodes of weak policies (data.policy_episodes)"
 BETTER_GOALS = "train the text model longer (world_model.text_num_iterations), or set reward.dense_weight to 0"
@@ -139,7 +146,12 @@ def _picture_criteria(
         criteria.append(Criterion(name, ratio, limit, rule, outcome, OTHER_ACTIONS, (low, high)))
     else:
         notes.append("Sensitivity to actions was not judged: no two held-out episodes differ in their actions.")
-    notes.append("Features are the tokenizer's: what it does not encode, e.g. a thing of few pixels, they do not see.")
+    if (worst := worst_varying_step(metrics)) is not None:
+        name, value = f"varying pixels, unexplained, step {worst}", at_step(metrics, "varying_error", worst)
+        criteria.append(_below(name, value, config.acceptance.varying_error_ratio, None, LOST_THINGS))
+    else:
+        notes.append(f"What the tokenizer loses was not judged: fewer than {ENOUGH} episodes are held out, or their "
+                     "pictures do not differ.")
     if step < num_steps:
         notes.append(f"Pictures were judged up to step {step}, which half of the held-out episodes reach; imagined "
                      f"episodes have up to {num_steps}.")

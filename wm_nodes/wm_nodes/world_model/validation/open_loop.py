@@ -107,13 +107,15 @@ def evaluate_rollouts(
     `ratio_high`). object_moved_: over the episodes whose object moved. done_<task>_: episodes counted as successful
     when the signal exceeds `threshold` anywhere, against success anywhere in the recording.
 
-    Without ground truth, or where the tasks' files name no positions, there is no object_ and tool_ and no moved_share.
+    Without ground truth, where the tasks' files name no positions, or where the model reads none, there is no object_
+    and tool_ and no moved_share.
     """
     imagined = imagine_episodes(tokenizer, model, episodes)
     truth = episode_targets(episodes)
     metrics: dict[str, float] = {"episodes": float(len(episodes))}
     thing, tool = (columns_of(episodes.tasks[0], name) for name in ("object", "tool"))
-    has_positions = truth.shape[-1] > 0 and bool(thing and tool)
+    has_reader = probe is not None or tokenizer.num_positions > 0
+    has_positions = has_reader and truth.shape[-1] > 0 and bool(thing and tool)
     if has_positions:
         read = position_reader(tokenizer, probe)
         real, predicted = read(episodes.images), read(imagined.frames)

@@ -1,7 +1,8 @@
 """How far rollouts are from the recording by their pictures alone: what is known without ground truth. Shapes:
-E episodes, T steps, S tokens, D values per token.
+E episodes, T steps, S tokens, D values per token, N pixels.
 
-The distance of two frames is the mean absolute difference of the latents that the tokenizer encodes them to.
+The distance of two frames is the mean absolute difference of the latents that the tokenizer encodes them to. What the
+latents themselves have lost is seen in the pixels that vary between episodes at the same step.
 """
 
 import re
@@ -23,6 +24,12 @@ from wm_nodes.world_model.validation.acceptance_report import at_step
 from wm_nodes.world_model.validation.controllability import under_actions
 from wm_nodes.world_model.validation.open_loop import BATCH, HORIZONS, imagine_episodes
 
+VARIES = 0.04
+"""A pixel varies between episodes whose standard deviation, of [0, 1], is above this: less may be noise."""
+WORST = 0.9
+"""Quantile of the varying pixels: the tenth that is shown worst."""
+ENOUGH = 24
+"""Episodes whose variance per pixel says something: of 8, good models fail."""
 SAME_ACTION = 1e-3
 """Two episodes whose actions differ by less than this on average show nothing of what actions do."""
 
@@ -35,12 +42,15 @@ def picture_metrics(models: WorldModels, episodes: EpisodeArrays) -> dict[str, f
     feature_floor: the same of recorded frames that are encoded and decoded, which a rollout can hardly undercut.
     other_actions: distance under the next episode's actions over that under the recorded ones, of episodes whose
     actions differ: 1 where actions are ignored. `_low`, `_high`: 95 %, bootstrap over episodes.
+    varying_error: see there, of encoded and decoded frames, at these steps and of the first ones (h00).
     """
     tokenizer, others = models.tokenizer, np.roll(episodes.actions, 1, axis=0)
     rollouts = imagine_episodes(tokenizer, models.action, episodes).frames
     misled = imagine_episodes(tokenizer, models.action, under_actions(episodes, others, models.spec)).frames
     differ = np.abs(episodes.actions - others).mean(2)
-    metrics = dict[str, float]()
+    first = episodes.images[:, 0]
+    decoded = _in_batches(tokenizer.decode, _in_batches(tokenizer.encode, first)).cpu().numpy()
+    metrics = {"varying_error_h00": varying_error(decoded, first)}
     for horizon in sorted({min(h, episodes.num_steps) for h in HORIZONS}):
         rows = np.flatnonzero(episodes.lengths >= horizon)
         if not len(rows):
@@ -55,6 +65,7 @@ def picture_metrics(models: WorldModels, episodes: EpisodeArrays) -> dict[str, f
         misled_by = rolled[:0]
         if both.any():
             misled_by = _distances(tokenizer, misled[rows[both], horizon - 1], real[torch.from_numpy(both)])
+        metrics[f"varying_error_h{horizon:02d}"] = varying_error(reconstructed, episodes.images[rows, horizon])
         metrics[f"feature_episodes_h{horizon:02d}"] = float(len(rows))
         metrics[f"feature_floor_h{horizon:02d}"] = _ratio(floor, copied)
         for name, top, bottom in (("feature_ratio", rolled, copied), ("other_actions", misled_by, rolled[both])):
@@ -66,9 +77,30 @@ def picture_metrics(models: WorldModels, episodes: EpisodeArrays) -> dict[str, f
     return metrics
 
 
+def varying_error(frames: UInt8Array, recorded: UInt8Array) -> float:
+    """Squared error of frames (E, H, W, 3) over the variance of the recorded ones, per pixel; of the pixels that vary,
+    the quantile WORST; NaN where none varies, or of fewer than ENOUGH episodes.
+
+    0 shows all that differs between the episodes, 1 no more than their mean frame does. Each pixel counts by its own
+    variance, so that a small thing counts beside a large one.
+    """
+    real, shown = (images.reshape(len(images), -1, 3).astype(np.float32) / 255 for images in (recorded, frames))
+    errors_N, variances_N = np.square(shown - real).mean((0, -1)), real.var(0).mean(-1)
+    varies = variances_N > VARIES**2
+    if len(real) < ENOUGH or not varies.any():
+        return float("nan")
+    return float(np.quantile(errors_N[varies] / variances_N[varies], WORST))
+
+
 def horizons_of(metrics: Mapping[str, float | None]) -> list[int]:
     """The steps of which picture_metrics holds anything, ascending."""
     return sorted(int(found[1]) for name in metrics if (found := re.fullmatch(r"feature_episodes_h(\d+)", name)))
+
+
+def worst_varying_step(metrics: Mapping[str, float | None]) -> int | None:
+    """The step up to judged_horizon with the largest varying_error; None where it is known at none of them."""
+    errors = {step: at_step(metrics, "varying_error", step) for step in range(judged_horizon(metrics) + 1)}
+    return max((step for step in errors if np.isfinite(errors[step])), key=lambda step: errors[step], default=None)
 
 
 def judged_horizon(metrics: Mapping[str, float | None]) -> int:
@@ -83,10 +115,11 @@ def horizon_table(metrics: Mapping[str, float | None]) -> Table:
         value, low, high = (at_step(metrics, f"{name}{end}", step) for end in ("", "_low", "_high"))
         return decimal(value) + (f" ({low:.2f} to {high:.2f})" if np.isfinite(low) else "")
 
-    columns = ("step", "episodes", "rollout / first frame", "reconstruction / first frame", "other / recorded actions")
+    columns = ("step", "episodes", "rollout / first frame", "reconstruction / first frame", "other / recorded actions",
+               "varying pixels, unexplained")
     return make_table("distance to held-out recordings, by features", columns, (
         (step, int(metrics[f"feature_episodes_h{step:02d}"] or 0), shown("feature_ratio", step),
-         shown("feature_floor", step), shown("other_actions", step))
+         shown("feature_floor", step), shown("other_actions", step), shown("varying_error", step))
         for step in horizons_of(metrics)
     ), left=())
 

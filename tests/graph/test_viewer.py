@@ -1,0 +1,111 @@
+"""The live page of a running graph: what it shows, and that nobody waits for it, whatever becomes of it."""
+
+import http.client
+import json
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from deadlines import PATIENCE_S
+from graph.harness import Graph, Probe, own_domain, wait_until
+from graph.test_runner import graph as runner_graph
+from graph.test_runner import tiny
+from graph.test_training import train, weights_in
+
+from wm_msgs.action import Train
+from wm_nodes.config.load import load_config
+from wm_nodes.launching.graph import NodeSpec
+from wm_nodes.launching.runner import Runner
+from wm_nodes.reports.live_page import LivePage
+
+pytestmark = [pytest.mark.graph, pytest.mark.kills, pytest.mark.slow]
+NODES = {f"/wm/{name}" for name in ("environment", "policy", "reward_evaluator", "learner")}
+
+
+def read_panels(url: str, until: Any) -> dict[str, Any]:
+    """The newest content of each panel, once until(panels) is true. Fails where the page ends before."""
+    host = url.removeprefix("http://").rstrip("/")
+    connection = http.client.HTTPConnection(host, timeout=PATIENCE_S)
+    connection.request("GET", "/events")
+    events, panels = connection.getresponse(), dict[str, Any]()
+    deadline = time.monotonic() + PATIENCE_S
+    while not until(panels):
+        assert time.monotonic() < deadline, f"not whole within {PATIENCE_S:g} s: {panels}"
+        line = events.readline()
+        assert line, f"the page ended with {sorted(panels)}"
+        if line.startswith(b"data: "):
+            event = json.loads(line.removeprefix(b"data: "))
+            panels[event["panel"]] = event["content"]
+    connection.close()
+    return panels
+
+
+def is_whole(panels: dict[str, Any]) -> bool:
+    """Whether a picture, every node and the loss of both updates have come."""
+    return (
+        panels.keys() >= {"pictures /wm", "charts", "nodes", "run"}
+        and [len(line["points"]) for chart in panels["charts"]["charts"] for line in chart["lines"]
+             if chart["title"].startswith("value loss")] == [2]
+        and {row["node"] for row in panels["nodes"]["rows"]} >= NODES
+    )
+
+
+def start_viewed(graph: Graph) -> str:
+    """Start the nodes of a training and the viewer; the page's URL."""
+    graph.start("viewer")
+    graph.start_environment(view_env=0)
+    graph.start_policy(await_nodes=["environment", "reward_evaluator", "learner"])
+    graph.start_reward()
+    graph.start_learner()
+    log = graph.log_path("/wm/viewer")
+    text = wait_until("the URL", lambda: "live page http" in log.read_text() and log.read_text())
+    return str(text.partition("live page ")[2].split()[0])
+
+
+def test_a_training_is_shown_and_ends_with_the_same_weights_where_the_viewer_is_killed_or_never_was(
+    tmp_path: Path,
+) -> None:
+    weights = []
+    for viewed in (True, False):
+        with own_domain() as domain:
+            graph, probe = Graph(domain, tmp_path / f"viewed_{viewed}", load_config("smoke")), Probe(domain)
+            try:
+                if viewed:
+                    url = start_viewed(graph)
+                else:
+                    graph.start_training_nodes()
+                assert train(probe, updates=2).termination_reason == Train.Result.FINISHED
+                if viewed:
+                    panels = read_panels(url, is_whole)
+                    assert panels["pictures /wm"]["environment"] == "toy/reach" and panels["pictures /wm"]["picture"]
+                    assert all(row["level"] == 0 for row in panels["nodes"]["rows"] if row["node"] in NODES)
+                    assert "/wm/viewer" not in {row["node"] for row in panels["nodes"]["rows"]}
+                    graph.processes["/wm/viewer"].send_signal(signal.SIGKILL)
+                result = train(probe, updates=2)
+                assert (result.termination_reason, result.updates) == (Train.Result.FINISHED, 4), result.message
+                losses = [text for texts in probe.seen_errors.values() for text in texts]
+                assert losses == [], "nobody misses the viewer"
+                weights.append(weights_in(graph.folder))
+            finally:
+                graph.stop()
+                probe.close()
+    assert weights[0] == weights[1] and len(weights[0]) == 5
+
+
+def test_a_viewer_that_cannot_open_its_page_does_not_end_the_graph(ros_domain: int, tmp_path: Path) -> None:
+    with LivePage() as other:
+        viewers = [
+            NodeSpec("wm_nodes.nodes.viewer_node", name, "/wm", {"port": port}, lifecycle=False, required=False)
+            for name, port in (("viewer", 0), ("refused", other.port))
+        ]
+        with Runner(runner_graph(tiny("a"), *viewers), log=None, log_dir=tmp_path) as runner:
+            runner.wait_ready(60)
+            assert runner.wait_ended("refused", 60) == 1
+            text = (tmp_path / "wm.refused.log").read_text()
+            assert f"error: port {other.port} of this host cannot be used" in text and "Traceback" not in text
+            log = tmp_path / "wm.viewer.log"
+            wait_until("the page", lambda: log.is_file() and "live page http" in log.read_text())
+            assert runner.wait(0.5) == 0 and runner.failure() is None
+        assert runner.wait_ended("viewer") == 0, "SIGINT ends it in order"

@@ -1,0 +1,159 @@
+"""The world model as Gymnasium environments: Gymnasium's own check, and its layout of automatic resets."""
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+from wm_nodes.config.load import load_config
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.environments.maniskill.spec import simulation_spec
+from wm_nodes.environments.spaces import observation_space
+from wm_nodes.policy_rl.gym import ID
+from wm_nodes.reward import RewardInput, RewardResult, RuleReward
+from wm_nodes.reward.base import assemble
+
+N, LIMIT = 3, 3
+SHORT = {"simulation.max_episode_steps": LIMIT}
+AT_ONCE = {"reward.success_threshold": 0.0}
+"""Every done signal counts as success."""
+
+
+def made(num_envs: int = N, **arguments: Any) -> VectorEnv:  # type: ignore[type-arg]
+    return gymnasium.make_vec(ID, num_envs, task="push_cube", **{"settings": SHORT, **arguments})
+
+
+@pytest.fixture(scope="module")
+def envs() -> Iterator[VectorEnv]:  # type: ignore[type-arg]
+    environment = made()
+    yield environment
+    environment.close()
+
+
+def actions(step: int, num_envs: int = N) -> np.ndarray:
+    return numpy_stream(step, "actions").uniform(-1, 1, (num_envs, 3)).astype(np.float32)
+
+
+def layout(infos: dict[str, Any]) -> dict[str, Any]:
+    """The names in infos, and the masks."""
+    return {
+        key: layout(value) if isinstance(value, dict) else value.tolist() if key.startswith("_") else None
+        for key, value in infos.items()
+    }
+
+
+class Unpaid(RuleReward):
+    def evaluate(self, step: RewardInput) -> RewardResult:
+        nothing = np.zeros(len(step.images), np.float32)
+        return assemble(nothing, nothing, step, nothing.astype(np.uint8), {"nobody pays": nothing == 0}, {})
+
+
+def unpaid(config: RunConfig) -> Unpaid:
+    return Unpaid()
+
+
+def test_gymnasium_finds_nothing_to_complain_about_in_a_single_one() -> None:
+    environment = gymnasium.make(ID, task="push_cube", render_mode="rgb_array")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(environment.unwrapped)
+    environment.reset(seed=1)
+    assert environment.render().shape == (64, 128, 3)
+    environment.close()
+
+
+def test_observations_fit_their_space_and_a_seed_decides_where_episodes_begin(envs: VectorEnv) -> None:  # type: ignore[type-arg]
+    first, again, other = (envs.reset(seed=seed)[0] for seed in (1, 1, 2))
+    assert envs.observation_space.contains(first) and set(first) == {"image", "state"}
+    np.testing.assert_array_equal(first["image"], again["image"])
+    assert (first["image"] != other["image"]).any()
+
+
+def test_a_step_that_ends_an_episode_shows_the_next_one_and_keeps_the_last_observation(envs: VectorEnv) -> None:  # type: ignore[type-arg]
+    disabled = made(autoreset_mode="Disabled")
+    assert envs.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    assert disabled.metadata["autoreset_mode"] == AutoresetMode.DISABLED
+    for environment in (envs, disabled):
+        environment.reset(seed=7)
+        steps = [environment.step(actions(step)) for step in range(LIMIT)]
+        assert [step[3].all() for step in steps] == [False, False, True]
+    last = steps[-1][0]
+    envs.reset(seed=7)
+    *_, (shown, _, _, _, infos) = (envs.step(actions(step)) for step in range(LIMIT))
+    assert infos["_final_obs"].all() and infos["_final_info"].all() and "is_success" not in infos
+    for i in range(N):
+        np.testing.assert_array_equal(infos["final_obs"][i]["image"], last["image"][i])
+        np.testing.assert_array_equal(infos["final_obs"][i]["state"], last["state"][i])
+    assert (shown["image"] != last["image"]).any()
+    assert envs.step(actions(9))[4]["_is_success"].all()
+
+
+def test_infos_are_laid_out_as_gymnasium_does_it_for_single_environments(envs: VectorEnv) -> None:  # type: ignore[type-arg]
+    singles = made(vectorization_mode="sync", vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP})
+    for environment in (envs, singles):
+        environment.reset(seed=3)
+    for step in range(LIMIT):
+        ours, theirs = (layout(environment.step(actions(step))[4]) for environment in (envs, singles))
+        assert ours == theirs and ("final_info" in ours) is (step == LIMIT - 1)
+
+
+def test_without_automatic_resets_those_of_the_mask_begin_anew_and_no_other(envs: VectorEnv) -> None:  # type: ignore[type-arg]
+    disabled = made(autoreset_mode=AutoresetMode.DISABLED)
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"environments \[0, 1, 2\] have ended"):
+        disabled.step(actions(0))
+    disabled.reset(seed=0)
+    last = [disabled.step(actions(step)) for step in range(LIMIT)][-1][0]
+    mask = np.array([True, False, True])
+    shown, _ = disabled.reset(options={"reset_mask": mask})
+    assert [bool((shown["image"][i] != last["image"][i]).any()) for i in range(N)] == mask.tolist()
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"environments \[1\] have ended; reset them"):
+        disabled.step(actions(0))
+    disabled.reset(options={"reset_mask": ~mask})
+    assert not disabled.step(actions(0))[3].any()
+    with pytest.raises(ValueError, match=r"reset_mask must be a bool array of shape \(3,\), got \[1, 0, 1\]"):
+        disabled.reset(options={"reset_mask": [1, 0, 1]})
+
+
+def test_success_pays_once_and_ends_the_episode() -> None:
+    environment = made(settings=AT_ONCE)
+    environment.reset(seed=0)
+    _, rewards, terminated, truncated, infos = environment.step(actions(0))
+    assert rewards.tolist() == [1, 1, 1] and terminated.all() and not truncated.any()
+    assert infos["final_info"]["is_success"].all() and (infos["final_info"]["success_probability"] > 0).all()
+
+
+def test_a_reward_is_chosen_by_its_name_and_one_that_pays_nothing_is_refused() -> None:
+    hurried = made(settings={"reward.factory": "examples.own_reward:make"})
+    hurried.reset(seed=0)
+    np.testing.assert_allclose(hurried.step(actions(0))[1], -0.02)
+    nobody = made(settings={"reward.factory": f"{__name__}:unpaid"})
+    nobody.reset(seed=0)
+    with pytest.raises(ValueError, match="reward rule has none for a step: nobody pays"):
+        nobody.step(actions(0))
+
+
+def test_a_model_without_a_state_shows_pictures_alone() -> None:
+    spec = simulation_spec("push_cube", load_config("cpu").simulation, 1)
+    unbounded = replace(spec, state_low=(), state_high=())
+    assert set(observation_space(replace(unbounded, state_names=(), state_units=()))) == {"image"}
+    measured = observation_space(unbounded)["state"]
+    assert measured.contains(np.full(3, -1e6, np.float32))
+
+
+def test_the_task_is_that_of_the_folder_and_what_does_not_fit_is_refused() -> None:
+    environment = gymnasium.make_vec(ID, 1, model_dir=shipped_model("push"))
+    assert environment.single_action_space.shape == (7,)
+    with pytest.raises(ValueError, match="give model_dir, or the task of a shipped one"):
+        gymnasium.make_vec(ID, 1)
+    with pytest.raises(ValueError, match="autoreset_mode NextStep is not served"):
+        made(autoreset_mode="NextStep")
+    with pytest.raises(ValueError, match=r"unknown setting 'reward\.treshold'"):
+        made(settings={"reward.treshold": 1})

@@ -1,0 +1,111 @@
+"""Rows of the tables of docs/results/video_tasks.md; what they are about stands in pages.yaml."""
+
+import math
+from statistics import mean, variance
+
+from benchmarks.tables.table import Rows, Run, interval, lines, percent, points, read, runs
+from benchmarks.tables.video_rl import gained, over_seeds, samplers
+from benchmarks.video_rl.comparison import compare_samplers
+
+OUTCOME, EARLY, JUDGED = (f"video_rl_outcome{of}.json" for of in ("", "_early", "_judge"))
+CLOSED_LOOP, ENVIRONMENTS = "video_rl_closed_loop.jsonl", "environments.jsonl"
+PROBE_PAID, JUDGE_PAID = "CPS 0.4", "CPS 0.4, judge robot"
+CHANGES = (("error_cm", 2), ("object_cm", 2), ("tool_cm", 2), ("psnr_db", 2))
+UNPAID = (
+    ("executed_success", 3), ("executed_object_cm", 1), ("reader_success", 3), ("object_permanence", 3),
+    ("impossible_tool_steps", 3),
+)
+ACCEPTED = ("accepted", "accepted_executed")
+T_10 = 2.228  # 97.5 % quantile of Student's t for 10 degrees of freedom
+
+
+def outcome() -> Rows:
+    for file, base in ((OUTCOME, ""), (EARLY, "early"), (JUDGED, "")):
+        rows = read(file)["rows"]
+        for name, trained in samplers(rows).items():
+            ends = (percent(mean(one["evaluations"][place]["success"] for one in trained)) for place in (0, -1))
+            against = compare_samplers(rows, name, PROBE_PAID, ["success_path"]) if name != PROBE_PAID else None
+            path = against.differences["success_path"] if against else None
+            yield (
+                name, base, len(trained), " → ".join(ends), *gained(trained, [("success", 3)]),
+                interval(path.mean, path.low, path.high, 3) if path else "",
+            )
+
+
+def unpaid() -> Rows:
+    rows = [one for one in read(OUTCOME)["rows"] + read(JUDGED)["rows"] if "measured_after" in one]
+    for name, trained in samplers(rows).items():
+        cells = []
+        for metric, digits in UNPAID:
+            before, after = ([one[f"measured_{when}"][metric] for one in trained] for when in ("before", "after"))
+            changed = over_seeds([later - first for first, later in zip(before, after, strict=True)], digits)
+            cells.append(f"{mean(before):.{digits}f} {changed}")
+        yield name, len(trained), *cells
+
+
+def executed() -> Rows:
+    rows = sorted(read(OUTCOME)["rows"] + read(JUDGED)["rows"], key=lambda one: int(one["seed"]))
+    judged = samplers(rows)[JUDGE_PAID]
+    judge, probe = ([one["measured_after"]["executed_success"] for one in samplers(rows)[name]]
+                    for name in (JUDGE_PAID, PROBE_PAID))
+    change, (a, b) = mean(judge) - mean(probe), (variance(some) / len(some) for some in (judge, probe))
+    freedom = (a + b) ** 2 / (a**2 / (len(judge) - 1) + b**2 / (len(probe) - 1))
+    if int(freedom) != 10:
+        raise ValueError(f"Student's t is known for 10 degrees of freedom, got {freedom:.1f}; add its quantile")
+    half, cells = T_10 * math.sqrt(a + b), []
+    for when in ("before", "after"):
+        accepted, real = (mean(one[f"measured_{when}"][key] for one in judged) for key in ACCEPTED)
+        cells += [percent(accepted), percent(real / accepted)]
+    first = probe[: len(judge)]
+    for paid_by, values, apart in (
+        ("judge", judge, interval(change, change - half, change + half, 3)), ("probe", probe, ""),
+        ("probe, first six", first, f"{mean(judge) - mean(first):+.3f}"),
+    ):
+        by_seed = ", ".join(f"{value:.2f}" for value in values)
+        yield paid_by, by_seed, f"{mean(values):.3f}", apart, *(cells if paid_by == "judge" else [""] * 4)
+
+
+def closed_loop() -> Rows:
+    trainings = closed_loop_trainings()
+    for name, trained in trainings.items():
+        better = mean(one["evaluations"][-1]["win"] for one in trained)
+        yield name, len(trained), f"{trained[0]['learning_rate']:g}", *gained(trained, CHANGES), f"{100 * better:.0f}"
+    rows = [one for trained in trainings.values() for one in trained]
+    for name, base in (("CPS 0.4", "recordings"), ("DynDiff 0.54 gated, rms", "CPS 0.4")):
+        if pair := compare_samplers(rows, name, base, ["error_cm"]):
+            found = pair.differences["error_cm"]
+            apart = interval(found.mean, found.low, found.high, 2)
+            yield f"{name} - {base}", len(pair.seeds), "", apart, "", "", "", ""
+
+
+def closed_loop_trainings() -> dict[str, list[Run]]:
+    return samplers([one for run in lines(CLOSED_LOOP) for one in run["rows"]])
+
+
+def by_clip() -> Rows:
+    trained = closed_loop_trainings()["CPS 0.4"]
+    for clip in range(1, 5):
+        yield clip, *gained(trained, [(f"{name}_cm_{clip}", 2) for name in ("object", "tool")])
+
+
+def trained_in() -> Rows:
+    found = runs(ENVIRONMENTS)
+    rows, correlations = found["trained in"]["rows"], found["ranking"]["correlations"]
+    for model in dict.fromkeys(one["model"] for one in rows):
+        of = [one for one in rows if one["model"] == model]
+        real, imagined = (mean(one[name]["rate"] for one in of) for name in ("real_after", "imagined_after"))
+        yield (
+            model, ", ".join(percent(one["real_after"]["rate"]) for one in of), percent(real), percent(imagined),
+            f"{100 * (imagined - real):+.1f}",
+            "{correlation:+.2f} [{low:+.2f}, {high:+.2f}]".format(**correlations[model]),
+        )
+
+
+def models_compared() -> Rows:
+    rows = runs(ENVIRONMENTS)["trained in"]["rows"]
+    after = {(one["model"], one["seed"]): one["success_after"] for one in rows}
+    seeds = sorted({one["seed"] for one in rows})
+    for better, base in (("video model after", "video model before"), ("world model", "video model after")):
+        won, base_won = ([x for seed in seeds for x in after[model, seed]] for model in (better, base))
+        rates = [100 * (mean(after[better, seed]) - mean(after[base, seed])) for seed in seeds]
+        yield f"{better} - {base}", len(won), points(base_won, won), over_seeds(rates, 1)

@@ -1,0 +1,56 @@
+"""Stable-Baselines3's PPO in the world model (policy_rl/gym.py); pip install stable-baselines3==2.9.2.
+
+python -m examples.imagined_sb3 3
+"""
+import sys
+from typing import Any
+
+import gymnasium
+import numpy as np
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+
+
+class ImaginedVecEnv(VecEnv):
+    """A vector environment of Gymnasium with autoreset_mode SAME_STEP, as Stable-Baselines3 wants one."""
+
+    def __init__(self, envs: gymnasium.vector.VectorEnv[Any, Any, Any]) -> None:
+        self._envs = envs
+        super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
+
+    def reset(self) -> Any:
+        return self._envs.reset(seed=self._seeds[0])[0]
+
+    def step_async(self, actions: Any) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> Any:
+        shown, rewards, terminated, truncated, infos = self._envs.step(self._actions)
+        each: list[dict[str, Any]] = [{} for _ in rewards]
+        for i in np.flatnonzero(terminated | truncated):
+            each[i] = {"terminal_observation": infos["final_obs"][i], "is_success": bool(terminated[i]),
+                       "TimeLimit.truncated": bool(truncated[i])}
+        return shown, rewards.astype(np.float32), terminated | truncated, each
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [getattr(self._envs, attr_name)] * self.num_envs
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        return [False] * self.num_envs
+
+    def close(self) -> None: ...
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None: ...
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any: ...
+
+
+def main(words: list[str] | None = None) -> None:
+    updates = int((words or sys.argv[1:])[-1])
+    envs = gymnasium.make_vec("wm_nodes.policy_rl.gym:wm_nodes/Imagined-v0", num_envs=64, task="reach")
+    model = PPO("MultiInputPolicy", VecMonitor(ImaginedVecEnv(envs)), n_steps=16, batch_size=256, n_epochs=4, seed=0)
+    for update in range(1, updates + 1):
+        model.learn(16 * envs.num_envs, reset_num_timesteps=False)
+        print(f"update {update}: imagined success {np.mean(model.ep_success_buffer):.1%}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,41 @@
+"""Record your environment through the graph, in it a policy of your own; then `wm train-model --bags BAG`.
+
+python -m examples.record /tmp/own_bag --environment.factory examples.own_environment:make
+    --policy.factory wm_nodes.policy_rl.factories:untrained_policy --steps 40
+"""
+import argparse
+import json
+import os
+import sys
+from pathlib import Path
+
+from wm_nodes.config.load import split_settings
+from wm_nodes.launching import arguments
+from wm_nodes.launching.graph_client import GraphClient
+from wm_nodes.launching.runner import Runner
+
+
+def main(words: list[str] | None = None) -> int:
+    options, settings = split_settings(sys.argv[1:] if words is None else words)
+    parser = argparse.ArgumentParser()
+    parser.add_argument("bag", type=Path, help="folder of the recording; what the nodes say lies in <bag>_run")
+    for name, default in (("preset", "cpu"), ("steps", 100), ("num-envs", 8), ("seed", 0), ("domain-id", "")):
+        parser.add_argument(f"--{name}", default=default, type=type(default))
+    given = parser.parse_args(options)
+    run_dir = given.bag.with_name(f"{given.bag.name}_run")
+    graph, _ = arguments.prepare("rollout_record", {
+        "backend": "environment", "task": "", "preset": given.preset, "num_envs": str(given.num_envs),
+        "seed": str(given.seed), "domain_id": given.domain_id, "bag_uri": str(given.bag), "run_dir": str(run_dir),
+        **{name: json.dumps(value) for name, value in settings.items()},
+    })
+    with Runner(graph, log=None, log_dir=run_dir / "logs") as runner:
+        runner.wait_ready()
+        os.environ.update(runner.environment)
+        with GraphClient(alive=runner.check) as client:
+            made = client.rollout(given.steps, seed=given.seed)
+    print(f"{given.bag}: {made.episodes} episodes, {made.successes} succeed")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
