@@ -8,6 +8,7 @@ from benchmarks.tables.video_rl import gained, over_seeds, samplers
 from benchmarks.video_rl.comparison import compare_samplers
 
 OUTCOME, EARLY, JUDGED = (f"video_rl_outcome{of}.json" for of in ("", "_early", "_judge"))
+EXECUTED = "video_rl_outcome_execution.json"
 CLOSED_LOOP, ENVIRONMENTS = "video_rl_closed_loop.jsonl", "environments.jsonl"
 PROBE_PAID, JUDGE_PAID = "CPS 0.4", "CPS 0.4, judge robot"
 CHANGES = (("error_cm", 2), ("object_cm", 2), ("tool_cm", 2), ("psnr_db", 2))
@@ -63,6 +64,26 @@ def executed() -> Rows:
     ):
         by_seed = ", ".join(f"{value:.2f}" for value in values)
         yield paid_by, by_seed, f"{mean(values):.3f}", apart, *(cells if paid_by == "judge" else [""] * 4)
+
+
+def execution_paid() -> Rows:
+    paid = read(EXECUTED)["rows"]
+    probe = {one["seed"]: one["measured_after"] for one in read(OUTCOME)["rows"] if one["sampler"] == PROBE_PAID}
+    probes = [probe[one["seed"]] for one in paid]
+    for name, after in (
+        ("action world model, 15 buffers", [one["measured_15"] for one in paid]),
+        ("action world model, 20 buffers", [one["measured_after"] for one in paid]), ("probe, 15 buffers", probes),
+    ):
+        real = [one["executed_success"] for one in after]
+        gains = [now - one["measured_before"]["executed_success"] for now, one in zip(real, paid, strict=True)]
+        apart = [now - one["executed_success"] for now, one in zip(real, probes, strict=True)]
+        kinds = [mean(one.get(kind, math.nan) for one in after) for kind in ("success", "execution_success")]
+        yield (
+            name, ", ".join(f"{value:.2f}" for value in real), f"{mean(real):.3f}", over_seeds(gains, 3),
+            "" if after is probes else over_seeds(apart, 3),
+            *(f"{kind:.3f}" if math.isfinite(kind) else "" for kind in kinds),
+            f"{mean(one['executed_object_cm'] for one in after):.1f}",
+        )
 
 
 def closed_loop() -> Rows:
