@@ -31,8 +31,9 @@ def test_a_page_for_newcomers_is_short(page: str) -> None:
     assert words(ROOT / page) <= MOST_WORDS[page]
 
 
-def test_all_documents_together_are_read_in_two_hours() -> None:
-    assert words(*documents()) <= 22_000
+def test_all_documents_together_stay_below_22_000_words() -> None:
+    """As `wc -w` counts them; tables that a command writes are left out."""
+    assert sum(len(page.read_text(encoding="utf-8").split()) for page in documents()) <= 22_000
 
 
 def test_links_of_documents_lead_somewhere() -> None:

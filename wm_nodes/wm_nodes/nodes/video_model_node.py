@@ -38,6 +38,8 @@ PARAMS = (
 
 
 BUFFER_FILES = VersionFiles("buffers/buffer")
+VERSIONS_KNOWN = 20
+"""Announcements kept, newest last."""
 
 
 class VideoModelNode(ManagedNode):
@@ -53,7 +55,7 @@ class VideoModelNode(ManagedNode):
         self._generator = ClipGenerator(folder, load_clips(bags, folder.clip["stride"], config.clip_steps), config)
         self._files = named_files(self)
         self._loaded = (0, "")  # version and, unless it is the folder's own, sha256
-        self._announced: PolicyVersion | None = None
+        self._announced = dict[int, PolicyVersion]()
         self._clips = self.publish_on("clips")
         self._images = self.publish_unnumbered("clips/image")
         self.listen("video/version", self._on_version, while_inactive=True)
@@ -67,7 +69,10 @@ class VideoModelNode(ManagedNode):
             self.diagnostics.gauge("version", self._loaded[0])
 
     def _on_version(self, message: PolicyVersion) -> None:
-        self._announced = message
+        self._announced.pop(message.version, None)
+        self._announced[message.version] = message
+        if len(self._announced) > VERSIONS_KNOWN:
+            del self._announced[next(iter(self._announced))]
 
     # Sampling, in a worker thread.
 
@@ -96,19 +101,20 @@ class VideoModelNode(ManagedNode):
         self.diagnostics.latency("sample", message.sample_s)
 
     def _follow(self, work: Work, version: int) -> None:
-        """Have the weights of `version`.
+        """Have the weights of `version`, which need not be the newest that was announced: others may announce, too.
 
         Raises:
             WireError: its file cannot be read. WeightsError: the file is not the announced one.
             ValueError: it is not announced within version_timeout_s.
         """
         deadline = time.monotonic() + float(self.param("version_timeout_s"))
-        while ((message := self._announced) is None or message.version != version) and version != self._loaded[0]:
+        while version not in self._announced and version != self._loaded[0]:
             if time.monotonic() > deadline:
-                known = "none" if message is None else message.version
+                known = ", ".join(map(str, list(self._announced))) or "none"
                 raise ValueError(f"asked for version {version}, video/version announced {known}; is a learner there?")
             work.sleep(0.02)
-        if message is not None and message.version == version and self._loaded != (version, message.sha256):
+        message = self._announced.get(version)
+        if message is not None and self._loaded != (version, message.sha256):
             load_weights(self._generator.folder.network, read_weights(message.uri, self._files), sha256=message.sha256)
             self._loaded = (version, message.sha256)
 
