@@ -16,7 +16,6 @@ from wm_nodes.policy_rl.gym import ID
 
 NAMES = ("own_environment", "own_learner", "own_policy", "own_reward", "own_task")
 IN_GYMNASIUM = ("imagined_ppo", "imagined_sb3")
-NO_SB3 = "Stable-Baselines3 is in requirements/gym.txt"
 FOLDER = Path(str(examples.__file__)).parent
 
 
@@ -46,14 +45,11 @@ def test_an_example_is_trained_with_by_its_command(
 def test_a_foreign_algorithm_trains_in_the_world_model_by_its_command(
     name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if name == "imagined_sb3":
-        pytest.importorskip("stable_baselines3", reason=NO_SB3)
     run_command(name, monkeypatch, tmp_path)
     assert len(re.findall(r"update \d+: imagined success \d", capsys.readouterr().out)) == 3
 
 
 def test_stable_baselines_hears_how_an_episode_ended_and_has_its_last_observation() -> None:
-    pytest.importorskip("stable_baselines3", reason=NO_SB3)
     from examples.imagined_sb3 import ImaginedVecEnv
 
     short = {"simulation.max_episode_steps": 2}
@@ -69,10 +65,11 @@ def test_stable_baselines_hears_how_an_episode_ended_and_has_its_last_observatio
 
 
 def test_stable_baselines_finds_nothing_wrong_with_a_single_one() -> None:
-    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason=NO_SB3)
+    from stable_baselines3.common import env_checker
+
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
-        checker.check_env(gymnasium.make(ID, task="push_cube"))
+        env_checker.check_env(gymnasium.make(ID, task="push_cube"))
 
 
 @pytest.mark.rendering
