@@ -364,6 +364,8 @@ def pretended_cuda() -> Iterator[Counts]:
         for name, answer in answers.items():
             stack.enter_context(patch.object(torch.cuda, name, lambda *args, answer=answer, **kwargs: answer))
         stack.enter_context(patch.object(torch.cuda, "synchronize", synchronize))
+        # a torch that is built for CUDA would look for a driver
+        stack.enter_context(patch.object(torch.accelerator, "current_accelerator", lambda *args, **kwargs: None))
         stack.enter_context(patch.object(torch._C, "_group_tensors_by_device_and_dtype", group_by_device))
         stack.enter_context(patch.object(torch.autocast, "__init__", autocast_to_cpu))
         stack.enter_context(_Kernels(memory, counts))
