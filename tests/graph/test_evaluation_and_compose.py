@@ -20,8 +20,6 @@ from wm_msgs.action import Evaluate, Rollout, Train
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.nodes.compose import make_nodes
-from wm_nodes.policy_rl.evaluation import evaluate
-from wm_nodes.policy_rl.exploit_meter import make_exploit_meter
 from wm_nodes.policy_rl.factories import (
     make_endogenous_reward,
     make_imagined_environment,
@@ -30,6 +28,8 @@ from wm_nodes.policy_rl.factories import (
 )
 from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.policy_rl.train import train_policy
+from wm_nodes.policy_rl.validation.evaluation import evaluate
+from wm_nodes.policy_rl.validation.exploit_meter import make_exploit_meter
 from wm_nodes.reports.summary import plain, read_readings
 from wm_nodes.training.weights import pack_weights, save_weights, unpack_weights
 from wm_nodes.world_model.starts import start_of

@@ -11,9 +11,9 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.types import BoolArray, Episode, FloatArray, Observation, StepResult, UInt64Array
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.episodes import scripted_episode
-from wm_nodes.policy_rl.evaluation import evaluate
 from wm_nodes.policy_rl.factories import make_policy
 from wm_nodes.policy_rl.image_policy import ImagePolicy
+from wm_nodes.policy_rl.validation.evaluation import evaluate
 
 CONFIG = load_config("smoke")
 PUSHED = (1_000_003, 1_000_008, 1_000_016, 1_000_024)

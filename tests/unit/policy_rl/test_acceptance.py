@@ -10,8 +10,8 @@ from unit.policy_rl.test_exploit_meter import SEEDS, ToyModel
 
 from wm_nodes.config.load import load_config
 from wm_nodes.policy_rl import factories
-from wm_nodes.policy_rl.acceptance import accept_model, acceptance_when_made
-from wm_nodes.policy_rl.exploit_meter import imagine_and_replay, measure_exploit
+from wm_nodes.policy_rl.validation.acceptance import accept_model, acceptance_when_made
+from wm_nodes.policy_rl.validation.exploit_meter import imagine_and_replay, measure_exploit
 
 CONFIG = load_config("smoke", {"data.num_workers": 1, "acceptance.num_episodes": 4, "acceptance.clone_episodes": 3})
 

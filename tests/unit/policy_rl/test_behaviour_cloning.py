@@ -12,7 +12,7 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import SftConfig
 from wm_nodes.core.types import Episode, UInt8Array
 from wm_nodes.policy_rl.behaviour_cloning import demonstrations, train_sft
-from wm_nodes.policy_rl.evaluation import evaluate
+from wm_nodes.policy_rl.validation.evaluation import evaluate
 
 
 def settings(**changes: float) -> SftConfig:

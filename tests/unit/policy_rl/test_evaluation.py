@@ -6,7 +6,7 @@ from graph.toy import ReachToy
 from rl_toys import toy_policy
 
 from wm_nodes.core.statistics import wilson_interval
-from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
+from wm_nodes.policy_rl.validation.evaluation import EvaluationResult, evaluate
 
 FIRST_SEED = 1_000_000
 

@@ -21,7 +21,6 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task
 from wm_nodes.core.types import Episode, Rollout
 from wm_nodes.policy_rl.behaviour_cloning import train_sft
-from wm_nodes.policy_rl.evaluation import evaluate
 from wm_nodes.policy_rl.factories import (
     make_endogenous_reward,
     make_imagined_environment,
@@ -31,6 +30,7 @@ from wm_nodes.policy_rl.factories import (
 )
 from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.rollouts import collect_rollout
+from wm_nodes.policy_rl.validation.evaluation import evaluate
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.weights import load_weights, pack_weights
 from wm_nodes.world_model import save_model_folder

@@ -20,8 +20,6 @@ from wm_nodes.core.model_folder import files_sha256
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.statistics import paired_difference, wilson_interval
 from wm_nodes.core.types import Environment
-from wm_nodes.policy_rl.acceptance import accept_model
-from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
 from wm_nodes.policy_rl.factories import (
     load_policy,
     make_endogenous_reward,
@@ -32,6 +30,8 @@ from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import prepare_start
 from wm_nodes.policy_rl.rollouts import rollout_statistics
 from wm_nodes.policy_rl.train import train_policy
+from wm_nodes.policy_rl.validation.acceptance import accept_model
+from wm_nodes.policy_rl.validation.evaluation import EvaluationResult, evaluate
 from wm_nodes.reward import RewardModel, RuleReward
 from wm_nodes.training.weights import save_weights
 from wm_nodes.video_model.folder import read_video_manifest

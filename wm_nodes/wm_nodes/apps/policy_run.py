@@ -26,10 +26,10 @@ from wm_nodes.core.types import BoolArray
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.graph_client import GraphClient
 from wm_nodes.launching.runner import Runner
-from wm_nodes.policy_rl.evaluation import evaluate
 from wm_nodes.policy_rl.factories import load_policy, make_imagined_environment, make_video_environment, models_of
 from wm_nodes.policy_rl.initial_policy import num_starts
 from wm_nodes.policy_rl.training_run import POLICY_FILES
+from wm_nodes.policy_rl.validation.evaluation import evaluate
 from wm_nodes.reports.stages import Stages
 from wm_nodes.reports.summary import SuccessRate
 from wm_nodes.training.checkpoint import RESTORE

@@ -31,15 +31,15 @@ from wm_nodes.core.progress import tqdm
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import Environment
 from wm_nodes.environments.registry import make_environment
-from wm_nodes.policy_rl.acceptance import accept_model
-from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
-from wm_nodes.policy_rl.exploit_meter import ExploitMeter, make_exploit_meter
 from wm_nodes.policy_rl.factories import load_policy, make_imagined_environment, make_reward
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import prepare_start
 from wm_nodes.policy_rl.model_refresh import Round, refresh_round, run_rounds, split_updates
 from wm_nodes.policy_rl.rollouts import rollout_statistics
 from wm_nodes.policy_rl.train import train_policy
+from wm_nodes.policy_rl.validation.acceptance import accept_model
+from wm_nodes.policy_rl.validation.evaluation import EvaluationResult, evaluate
+from wm_nodes.policy_rl.validation.exploit_meter import ExploitMeter, make_exploit_meter
 from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reports.summary import acceptance_outcome
 from wm_nodes.training.weights import save_weights

@@ -34,11 +34,11 @@ from wm_nodes.environments.registry import configured_spec, is_simulated, make_e
 from wm_nodes.judge.backends.factory import judge_name
 from wm_nodes.judge.episode_reward import check_agent, episode_judge
 from wm_nodes.launching.scenarios import IMAGINED
-from wm_nodes.policy_rl.acceptance import accept_model
-from wm_nodes.policy_rl.exploit_meter import start_seeds
 from wm_nodes.policy_rl.factories import check_model, load_policy, load_steppable
 from wm_nodes.policy_rl.initial_policy import num_starts, prepare_start, start_files
 from wm_nodes.policy_rl.pretraining import make_model
+from wm_nodes.policy_rl.validation.acceptance import accept_model
+from wm_nodes.policy_rl.validation.exploit_meter import start_seeds
 from wm_nodes.recording import read_spec
 from wm_nodes.reports.html import write_report
 from wm_nodes.reports.machine import machine_facts

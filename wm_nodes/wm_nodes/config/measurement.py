@@ -17,7 +17,7 @@ from wm_nodes.config.seed_ranges import EVALUATION
 
 class ExploitMeterConfig(SettingsSection):
     """How often the training asks the simulator whether what the model calls success is one; see
-    policy_rl/exploit_meter.py."""
+    policy_rl/validation/exploit_meter.py."""
 
     every: NonNegativeInt
     """Policy updates from one reading to the next; the first is of the policy that training begins with. 0: off."""

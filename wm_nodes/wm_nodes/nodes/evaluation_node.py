@@ -8,8 +8,8 @@ from wm_msgs.msg import PolicyVersion
 from wm_nodes.nodes.environment.remote_environment import RemoteEnvironment
 from wm_nodes.nodes.factories import existing, make_policy
 from wm_nodes.nodes.policy.weights import PolicyHolder, read_weights
-from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
 from wm_nodes.policy_rl.training_run import POLICY_FILES
+from wm_nodes.policy_rl.validation.evaluation import EvaluationResult, evaluate
 from wm_nodes.ros import convert
 from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.clients import RosEnvironmentClient

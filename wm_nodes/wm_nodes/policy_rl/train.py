@@ -10,18 +10,18 @@ from typing import Any
 from wm_nodes.config.load import load_config, split_settings
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.types import Environment, Rollout
-from wm_nodes.policy_rl import acceptance, factories
+from wm_nodes.policy_rl import factories
 from wm_nodes.policy_rl.device_rollout import make_collector
-from wm_nodes.policy_rl.exploit_meter import ExploitMeter
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.rollouts import Convergence, TensorRollout, rollout_statistics
+from wm_nodes.policy_rl.validation import acceptance, exploit_meter
 from wm_nodes.reward import RewardModel
 from wm_nodes.world_model import DeviceEnvironment
 
 
 def train_policy(
     policy: ImagePolicy, env: Environment | DeviceEnvironment, reward: RewardModel, config: RunConfig,
-    meter: ExploitMeter | None = None,
+    meter: exploit_meter.ExploitMeter | None = None,
 ) -> Iterator[tuple[Rollout | TensorRollout, Any]]:
     """Train `policy` in place for ppo.updates updates, or until `meter` stops it or it converged; yield each update."""
     learner = factories.make_learner(policy, config)  # PPO, unless learner.factory names another

@@ -8,8 +8,8 @@ from wm_nodes.core.types import Environment
 from wm_nodes.nodes.environment.remote_environment import RemoteEnvironment
 from wm_nodes.nodes.factories import existing
 from wm_nodes.nodes.learner.report import LearnerReport
-from wm_nodes.policy_rl.exploit_meter import ExploitMeter, ExploitReading, make_exploit_meter
 from wm_nodes.policy_rl.training_run import PolicyTraining
+from wm_nodes.policy_rl.validation.exploit_meter import ExploitMeter, ExploitReading, make_exploit_meter
 from wm_nodes.ros.clients import Check, RosEnvironmentClient
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.wire import PeerLost

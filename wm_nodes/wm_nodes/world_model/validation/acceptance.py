@@ -3,7 +3,7 @@ before that policy is trained in it (RS-12).
 
 The numbers of held-out episodes come from open_loop.py: recorded actions rolled out open-loop from recorded first
 frames. Positions are read off the imagined pictures by the judge's own probe; "copying" reads them off the first frame
-instead. Those of the policy come from rollouts of its own (policy_rl/acceptance.py).
+instead. Those of the policy come from rollouts of its own (policy_rl/validation/acceptance.py).
 """
 
 import math

@@ -5,11 +5,11 @@ from pathlib import Path
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.environments.record import acceptance_plan, collect_plan, keep_plan
 from wm_nodes.environments.registry import is_simulated, make_environment
-from wm_nodes.policy_rl.exploit_meter import IMAGINED_ENVS, imagine_and_replay
 from wm_nodes.policy_rl.factories import STARTS, make_imagined_environment, make_video_environment, models_of
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import write_starts
 from wm_nodes.policy_rl.pretraining import load_arrays
+from wm_nodes.policy_rl.validation.exploit_meter import IMAGINED_ENVS, imagine_and_replay
 from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.starts import load_start_seeds
 from wm_nodes.world_model.validation.acceptance import (

@@ -1,0 +1,1 @@
+"""Whether a model may train policies, and what policies are worth, imagined and real."""
