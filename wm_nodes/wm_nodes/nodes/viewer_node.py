@@ -21,7 +21,7 @@ from wm_nodes.reports.live_page import LivePage
 from wm_nodes.ros.middleware import set_node_defaults
 from wm_nodes.ros.params import COMMON, Param, declare
 from wm_nodes.ros.qos import topic
-from wm_nodes.ros.spin import executor_kind, init, make_executor, spin, stop_on_signals
+from wm_nodes.ros.spin import destroy, executor_kind, init, make_executor, spin, stop_on_signals
 
 PARAMS = (Param("port", 0, "Of the page, on this host only; 0: a free one", read_only=True, minimum=0, maximum=65535),)
 NICENESS = 10
@@ -74,9 +74,7 @@ def main() -> int:
             executor.add_node(node)
             spin(executor, stopped)
             node.page.close()
-            executor.remove_node(node)
-            node.destroy_node()
-            executor.shutdown()
+            destroy(executor, [node])
             del node, executor
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr, flush=True)

@@ -192,6 +192,14 @@ def _settle(executor: Executor, nodes: list[Any]) -> None:
     )
 
 
+def destroy(executor: Executor, nodes: Iterable[Any]) -> None:
+    """Destroy nodes and the executor that spun them; the caller then lets go of both."""
+    for node in nodes:
+        executor.remove_node(node)
+        node.destroy_node()
+    executor.shutdown()
+
+
 def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = None) -> int:
     """Create nodes, start them, spin until a signal, stop them, shut down. Return the exit code.
 
@@ -222,10 +230,7 @@ def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = 
                 with _mark_failed([node]):
                     node.stop()
             code = int(any(node.failed for node in nodes))
-            for node in nodes:
-                executor.remove_node(node)
-                node.destroy_node()
-            executor.shutdown()
+            destroy(executor, nodes)
             del node, executor
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
