@@ -15,9 +15,11 @@ from graph.test_runner import tiny
 from graph.test_training import train, weights_in
 
 from wm_msgs.action import Train
+from wm_msgs.msg import LearnerMetrics
 from wm_nodes.config.load import load_config
 from wm_nodes.launching.graph import NodeSpec
 from wm_nodes.launching.runner import Runner
+from wm_nodes.nodes.viewer.feed import PER_STEP, TABLE_S, TYPES, VIEW
 from wm_nodes.reports.live_page import LivePage
 
 pytestmark = [pytest.mark.graph, pytest.mark.kills, pytest.mark.slow]
@@ -59,6 +61,10 @@ def start_viewed(graph: Graph) -> str:
     graph.start_policy(await_nodes=["environment", "reward_evaluator", "learner"])
     graph.start_reward()
     graph.start_learner()
+    return page_of(graph)
+
+
+def page_of(graph: Graph) -> str:
     log = graph.log_path("/wm/viewer")
     text = wait_until("the URL", lambda: "live page http" in log.read_text() and log.read_text())
     return str(text.partition("live page ")[2].split()[0])
@@ -92,6 +98,45 @@ def test_a_training_is_shown_and_ends_with_the_same_weights_where_the_viewer_is_
                 graph.stop()
                 probe.close()
     assert weights[0] == weights[1] and len(weights[0]) == 5
+
+
+def subscriptions_of_the_viewer(probe: Probe) -> set[str]:
+    return {
+        name for name in (*TYPES, *(f"sim/{name}" for name in TYPES if not name.startswith("/")))
+        for end in probe.node.get_subscriptions_info_by_topic(probe.node.resolve_topic_name(name))
+        if end.node_name == "viewer"
+    }
+
+
+def test_the_viewer_takes_steps_and_pictures_only_while_somebody_looks_and_curves_always(
+    ros_domain: int, tmp_path: Path
+) -> None:
+    costly = {name for name in (*PER_STEP, "sim/env/transition", f"sim/{VIEW}") if name != "env/image"}
+    always = {*TYPES, "sim/env/spec", "sim/episode", "sim/run/state"} - {*PER_STEP}
+    graph, probe = Graph(ros_domain, tmp_path), Probe(ros_domain)
+    try:
+        graph.start("viewer", run_dir="''")
+        url = page_of(graph)
+        metrics = probe.publisher("learner/metrics")
+        wait_until("the viewer's ears", lambda: subscriptions_of_the_viewer(probe) >= always)
+        wait_until("their match", metrics.get_subscription_count)
+        for update in (1, 2, 3):
+            metrics.publish(LearnerMetrics(update=update, success_rate=0.25 * update))
+        time.sleep(3 * TABLE_S)
+        assert subscriptions_of_the_viewer(probe) == always, "nobody looks"
+        for _ in range(2):
+
+            def until(panels: dict[str, Any]) -> bool:
+                return "charts" in panels and subscriptions_of_the_viewer(probe) == always | costly
+
+            charts = read_panels(url, until)["charts"]["charts"]
+            assert [point[0] for point in charts[0]["lines"][0]["points"]] == [1, 2, 3], "what came before anybody looked"
+            wait_until("the end of looking", lambda: subscriptions_of_the_viewer(probe) == always)
+        assert graph.processes["/wm/viewer"].poll() is None
+    finally:
+        probe.close()
+        codes = graph.stop()
+    assert codes == {"/wm/viewer": 0}
 
 
 def test_a_viewer_that_cannot_open_its_page_does_not_end_the_graph(ros_domain: int, tmp_path: Path) -> None:
