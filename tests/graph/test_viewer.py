@@ -130,7 +130,7 @@ def test_the_viewer_takes_steps_and_pictures_only_while_somebody_looks_and_curve
                 return "charts" in panels and subscriptions_of_the_viewer(probe) == always | costly
 
             charts = read_panels(url, until)["charts"]["charts"]
-            assert [point[0] for point in charts[0]["lines"][0]["points"]] == [1, 2, 3], "what came before anybody looked"
+            assert [point[0] for point in charts[0]["lines"][0]["points"]] == [1, 2, 3], "from before"
             wait_until("the end of looking", lambda: subscriptions_of_the_viewer(probe) == always)
         assert graph.processes["/wm/viewer"].poll() is None
     finally:
