@@ -3,6 +3,8 @@
 import http.client
 import json
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -154,3 +156,16 @@ def test_a_viewer_that_cannot_open_its_page_does_not_end_the_graph(ros_domain: i
             wait_until("the page", lambda: log.is_file() and "live page http" in log.read_text())
             assert runner.wait(0.5) == 0 and runner.failure() is None
         assert runner.wait_ended("viewer") == 0, "SIGINT ends it in order"
+
+
+def test_the_benchmark_counts_the_cpu_time_of_the_nodes_with_and_without_the_page(tmp_path: Path) -> None:
+    program = "import sys; from wm_nodes.apps.cli import main; sys.exit(main(sys.argv[1:]))"
+    file = tmp_path / "view.json"
+    words = ["benchmark", "view", "--steps", "20", "--triples", "1", "--json", str(file)]
+    done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, encoding="utf-8", check=False)
+    assert done.returncode == 0 and "page in a browser" in done.stdout, done.stdout + done.stderr
+    results = json.loads(file.read_text())
+    assert results["nodes_cpu_ratio"]["no page"] == [1.0] and results["viewer_cpu_ratio"]["no page"] == [0.0]
+    assert results["viewer_cpu_ratio"]["page in a browser"][0] > 0
+    nodes = {"environment", "reward_evaluator", "policy", "recorder"}
+    assert [set(spent) for spent in results["cpu_s"][0].values()] == [nodes] * 3
