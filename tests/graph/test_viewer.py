@@ -111,11 +111,11 @@ def subscriptions_of_the_viewer(probe: Probe) -> set[str]:
 
 
 def test_the_viewer_takes_steps_and_pictures_only_while_somebody_looks_and_curves_always(
-    ros_domain: int, tmp_path: Path
+    domain: int, tmp_path: Path
 ) -> None:
     costly = {name for name in (*PER_STEP, "sim/env/transition", f"sim/{VIEW}") if name != "env/image"}
     always = {*TYPES, "sim/env/spec", "sim/episode", "sim/run/state"} - {*PER_STEP}
-    graph, probe = Graph(ros_domain, tmp_path), Probe(ros_domain)
+    graph, probe = Graph(domain, tmp_path), Probe(domain)
     try:
         graph.start("viewer", run_dir="''")
         url = page_of(graph)
