@@ -125,10 +125,9 @@ def _model_to_check(
 
 
 def _public(arguments: argparse.Namespace, config: VideoRlConfig, device: str) -> ModelToCheck:
-    from wm_nodes.video_model.adapters import LoadSettings, add_lora, load_public_model
+    from wm_nodes.video_model.adapters import add_lora, load_public_model
 
-    loading = LoadSettings(dtype=arguments.dtype, device=device, offload=arguments.offload)
-    public = load_public_model(arguments.public, loading)
+    public = load_public_model(arguments.public, dtype=arguments.dtype, device=device, offload=arguments.offload)
     frames = torch.from_numpy(np.stack([_picture(arguments)] * arguments.frames))[None]
     C, F, H, W = public.codec.encode(frames).shape[1:]
     condition = public.condition(frames[:, :1], [arguments.prompt], F).repeat_interleave(VIDEOS)

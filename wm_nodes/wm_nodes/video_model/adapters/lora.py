@@ -6,8 +6,7 @@ from typing import Any
 import torch
 
 from wm_nodes.training.checkpoint import read_tensors
-from wm_nodes.video_model.adapters.packages import package
-from wm_nodes.video_model.adapters.velocity import PublicVelocity, tuner_layers
+from wm_nodes.video_model.adapters.velocity import PublicVelocity, package, tuner_layers
 
 TARGETS = ("to_q", "to_k", "to_v", "to_out.0")
 """Attention projections of Wan's and Cosmos's blocks."""
