@@ -216,7 +216,7 @@ def test_a_rank_without_a_transition_has_a_gradient_of_zero_and_counts_nothing()
     learner = make(ranks=OneOfTwo(1, 2))
     buffer = buffer_of(learner)
     sums = learner.gradients(buffer, Rows(torch.tensor([0]), torch.tensor([1])), SIGNAL)
-    assert all(math.isfinite(value) for value in sums.values()) and sums["objective"] == sums["low"] == 0.0
+    assert all(math.isfinite(value) for value in sums.values()) and sums["objective"] == sums["clip_low_share"] == 0.0
     given = [None if p.grad is None else bool(p.grad.any()) for p in learner.parameters]
     full = make()
     gradient(full, buffer)

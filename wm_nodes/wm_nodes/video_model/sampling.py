@@ -152,7 +152,7 @@ def _sample(
         t, s = at[k].expand(N), at[k + 1].expand(N)
         v = guided_velocity(model, x, t, condition, settings.cfg).float()
         if k not in rollout.steps:
-            x = with_conditioning(ode_step(x, v, t, s, context, settings.sampler).mean, context.conditioning)
+            x = with_conditioning(ode_step(x, v, t, s, context).mean, context.conditioning)
             continue
         law = step(x, v, t, s, context, settings.sampler)
         z = step_noise(tuple(x.shape[1:]), seeds, k).to(x.device)

@@ -23,6 +23,7 @@ from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import CODEC, load_module, read_video_manifest
 from wm_nodes.video_model.tokenizer_codec import Codec
+from wm_nodes.world_model.position_probe import halving_convolutions
 
 CHANNELS, HIDDEN = (16, 32, 32, 48), 48
 BATCH = 256
@@ -38,15 +39,8 @@ class SuccessReader(nn.Module):
     def __init__(self, height: int, width: int, threshold: float = 0.5) -> None:
         super().__init__()
         self.height, self.width, self.threshold = height, width, threshold
-        layers: list[nn.Module] = []
-        previous = 3
-        for channels in CHANNELS:
-            layers += [nn.Conv2d(previous, channels, 5, stride=2, padding=2), nn.SiLU()]
-            previous = channels
-        cells = [-(-size // 2 ** len(CHANNELS)) for size in (height, width)]
-        self.layers = nn.Sequential(
-            *layers, nn.Flatten(), nn.Linear(previous * cells[0] * cells[1], HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, 1)
-        )
+        layers, values = halving_convolutions(CHANNELS, height, width)
+        self.layers = nn.Sequential(*layers, nn.Linear(values, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, 1))
 
     def forward(self, pixels_B3HW: Tensor) -> Tensor:
         """Logits (B,); pixels float in [0, 1]."""

@@ -56,7 +56,7 @@ def examine(
 
     Args:
         condition: of N >= 2 videos, where the model is; two of them at least should move.
-        config: its seed, groups (for the memory of a buffer), window, rollout and grpo are used.
+        config: its seed, window, rollout and grpo are used.
 
     Raises:
         ValueError: nothing can be trained with these settings: a sampler without noise, no step that can train, an
@@ -83,7 +83,6 @@ def examine(
         _check_ode(model, condition, noise, seeds, rollout),
         _check_mask(sampled, condition.num_conditioning, rollout),
         _check_round_trip(buffer),
-        _measure_memory(learner, sampled, config.groups.contexts * config.groups.group_size),
     ]
 
 
@@ -141,17 +140,6 @@ def _check_round_trip(buffer: RolloutBuffer) -> CheckResult:
     data = buffer.to_bytes()
     equal, size = RolloutBuffer.from_bytes(data).to_bytes() == data, f"{len(data) / MIB:.1f} MiB"
     return CheckResult("a saved buffer comes back equal", equal, size, "report this as a bug")
-
-
-def _measure_memory(learner: GrpoLearner, sampled: VideoRollout, videos: int) -> CheckResult:
-    """Measure what each KL anchor keeps beside the weights, for a buffer of `videos` videos."""
-    weights, scale = sum(p.nbytes for p in learner.parameters), videos / len(sampled.latents) / MIB
-    text = (
-        f"frozen: {weights / MIB:.2f} MiB of weights that train; buffer: {sampled.zeta.nbytes * scale:.2f} MiB of "
-        f"noise and {sampled.mask.nbytes * scale:.2f} MiB of masks for {videos} videos; dual: both; lora_off: nothing; "
-        f"chosen: {learner.settings.kl.anchor}"
-    )
-    return CheckResult("memory of the KL anchors", True, text, "")
 
 
 def _limits(rollout: RolloutConfig) -> tuple[float, float]:

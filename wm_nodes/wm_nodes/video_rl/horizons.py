@@ -66,9 +66,9 @@ def measure_headroom(
     for history in _histories(folder, contexts):
         request = replace(plain, history=history, iteration=history or 0)
         buffer = source.score(request, source.sample(request))
-        single, K = replace(request, group_size=1), buffer.condition.num_conditioning
+        single = replace(request, group_size=1)
         coded = folder.codec.decode(folder.codec.encode(source.references(single).frames))
-        ceiling = mix_rewards(source.scores(single, coded, K), config.rewards)
+        ceiling = mix_rewards(source.scores(single, coded), config.rewards)
         rewards = buffer.rewards["total"].view(-1, n)
         best = rewards.argmax(1, keepdim=True)
 

@@ -7,7 +7,6 @@ Shapes: M transitions (video, step) of one network call, U generated elements, S
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -91,17 +90,17 @@ class Anchored:
 
     def trained(self) -> dict[str, Tensor]:
         """Copy the model's parameters that train."""
-        return {name: p.detach().clone() for name, p in self.model.named_parameters() if p.requires_grad}
+        return {name: p.detach().clone() for name, p in trained_parameters(self.model)}
 
-    def call(self, weights: dict[str, Tensor], *arguments: Any) -> Any:
-        """Call the model with other weights, while the current ones keep their graph."""
-        return functional_call(self.model, weights, arguments)
+    def at(self, weights: dict[str, Tensor]) -> Callable[..., Any]:
+        """The model with other weights, while the current ones keep their graph."""
+        return lambda *arguments: functional_call(self.model, weights, arguments)
 
     @contextmanager
     def anchored(self) -> Iterator[Callable[..., Any]]:
         """Give the model as it is at the anchor."""
         if self.settings.kl.anchor != "lora_off":
-            yield partial(self.call, self.anchor)
+            yield self.at(self.anchor)
             return
         disable: Any = self.model.disable_adapter
         with disable():
@@ -171,3 +170,7 @@ class GrpoTerms(Anchored):
     def _anchor_zeta(self, buffer: RolloutBuffer, rows: Rows) -> Tensor:
         with self.anchored() as model:
             return self._transition(model, buffer, rows).zeta
+
+
+def trained_parameters(model: nn.Module) -> Iterator[tuple[str, Tensor]]:
+    return ((name, p) for name, p in model.named_parameters() if p.requires_grad)

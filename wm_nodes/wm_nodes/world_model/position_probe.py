@@ -4,6 +4,9 @@ It shares no weights and no layers with the world model, is trained on recorded 
 the world model, which therefore cannot learn to exploit it.
 """
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -23,16 +26,9 @@ class PositionProbe(nn.Module):
     def __init__(self, height: int, width: int, num_positions: int = NUM_POSITIONS) -> None:
         super().__init__()
         self.height, self.width = height, width
-        layers: list[nn.Module] = []
-        previous = 3
-        for channels in CHANNELS:
-            layers += [nn.Conv2d(previous, channels, 5, stride=2, padding=2), nn.SiLU()]
-            previous = channels
-        side = [-(-size // 2 ** len(CHANNELS)) for size in (height, width)]
-        self.features = nn.Sequential(*layers, nn.Flatten())
-        self.regress = nn.Sequential(
-            nn.Linear(previous * side[0] * side[1], HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, num_positions)
-        )
+        layers, values = halving_convolutions(CHANNELS, height, width)
+        self.features = nn.Sequential(*layers)
+        self.regress = nn.Sequential(nn.Linear(values, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, num_positions))
         self.mean: Tensor
         self.std: Tensor
         self.register_buffer("mean", torch.zeros(num_positions))
@@ -68,3 +64,12 @@ class PositionProbe(nn.Module):
         if tuple(pixels.shape[2:]) == (self.height, self.width):
             return pixels
         return interpolate(pixels, (self.height, self.width), mode="bilinear", antialias=True)
+
+
+def halving_convolutions(channels: Sequence[int], height: int, width: int) -> tuple[list[nn.Module], int]:
+    """Layers of pictures (B, 3, height, width), whose sides each convolution halves, and how many values they give."""
+    layers: list[nn.Module] = []
+    for before, after in pairwise((3, *channels)):
+        layers += [nn.Conv2d(before, after, 5, stride=2, padding=2), nn.SiLU()]
+    rows, columns = (-(-size // 2 ** len(channels)) for size in (height, width))
+    return [*layers, nn.Flatten()], channels[-1] * rows * columns

@@ -1,11 +1,9 @@
 """Low-rank adapters on a public model's attention, through peft. Adapter off is the base model: kl.anchor lora_off."""
 
 from pathlib import Path
-from typing import Any
 
 import torch
 
-from wm_nodes.training.checkpoint import read_tensors
 from wm_nodes.video_model.adapters.velocity import PublicVelocity, package, tuner_layers
 
 TARGETS = ("to_q", "to_k", "to_v", "to_out.0")
@@ -26,11 +24,13 @@ def add_lora(model: PublicVelocity, rank: int, alpha: float | None = None, *, se
     config = package("peft").LoraConfig(
         r=rank, lora_alpha=rank if alpha is None else alpha, target_modules=list(TARGETS), lora_dropout=0.0
     )
-    model.requires_grad_(False)
     with torch.random.fork_rng(devices=[]):  # the weights are drawn on the CPU, then moved
         torch.manual_seed(seed)
         model.transformer.add_adapter(config)
-    _train_adapter_alone(model)
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad_("lora_" in name)
+        if "lora_" in name:
+            parameter.data = parameter.data.float()
 
 
 def save_lora(model: PublicVelocity, folder: Path) -> None:
@@ -38,37 +38,3 @@ def save_lora(model: PublicVelocity, folder: Path) -> None:
     if not tuner_layers(model):
         raise ValueError("this model has no LoRA adapter to save")
     model.transformer.save_lora_adapter(folder, safe_serialization=True)
-
-
-def load_lora(model: PublicVelocity, folder: Path) -> None:
-    """Add the adapter that save_lora wrote to a model without one.
-
-    Raises:
-        ValueError: the folder holds none, or the model has one.
-    """
-    if tuner_layers(model):
-        raise ValueError("this model has a LoRA adapter already")
-    if not list(folder.glob("*.safetensors")):
-        raise ValueError(f"{folder} holds no LoRA adapter (*.safetensors); name a folder of save_lora")
-    model.requires_grad_(False)
-    model.transformer.load_lora_adapter(
-        str(folder), prefix=None, adapter_name="default", use_safetensors=True, local_files_only=True
-    )
-    _train_adapter_alone(model)
-    _copy_exactly(model.transformer, folder)
-
-
-@torch.no_grad()
-def _copy_exactly(transformer: Any, folder: Path) -> None:
-    """Write the file's float32 values again: diffusers loads them in the dtype of the base weights."""
-    parameters = {name.replace(".default.", "."): p for name, p in transformer.named_parameters() if "lora_" in name}
-    for path in sorted(folder.glob("*.safetensors")):
-        for name, tensor in read_tensors(path, "copy the adapter's folder again").items():
-            parameters[name].copy_(tensor)
-
-
-def _train_adapter_alone(model: PublicVelocity) -> None:
-    for name, parameter in model.named_parameters():
-        parameter.requires_grad_("lora_" in name)
-        if "lora_" in name:
-            parameter.data = parameter.data.float()

@@ -31,11 +31,12 @@ class PublicVelocity(nn.Module, ABC):
 
     def __init__(self, transformer: nn.Module, null_text: Tensor | None, no_frames: str, clean_time: float) -> None:
         super().__init__()
+        config: Any = transformer.config
         self.transformer: Any = transformer
         self.null_text: Tensor | None
         self.register_buffer("null_text", null_text, persistent=False)
-        self.patch: tuple[int, int, int] = tuple(self.transformer.config.patch_size)
-        self.channels = int(self.transformer.config.out_channels)
+        self.patch: tuple[int, int, int] = tuple(config.patch_size)
+        self.channels = int(config.out_channels)
         self.no_frames, self.clean_time = no_frames, clean_time
 
     def forward(self, x: Tensor, t: Tensor, condition: Condition, drop: Tensor | None = None) -> Tensor:
