@@ -135,14 +135,12 @@ def test_a_group_is_trained_and_evaluated_by_closeness_where_no_recording_has_si
     heldout = context_scores(folder, blind, probe, config)
     assert heldout["closeness"].isfinite().all() and set(PICTURE_SCORES) <= set(WATCHED)
     for one in measure_headroom(folder, blind, config, probe):
-        assert one.codec > one.reward and one.gain[0] > 0 and np.isnan(one.object_cm).all()
+        assert one.codec > one.reward and one.gain[0] > 0
 
 
 def test_settings_that_a_model_or_its_recordings_cannot_have_are_refused() -> None:
     with pytest.raises(ValueError, match="whole episodes"):
         make_source(folder=make_folder(given=0))
-    with pytest.raises(ValueError, match="goes on from 2 frames with 2 new ones, the settings say 3 and 2"):
-        make_source(folder=make_folder(given=2))
     with pytest.raises(ValueError, match="3 clips and one more have 9 frames, the recordings 8"):
         RecordedContexts(make_folder(), recorded(8), CONFIG)
     with pytest.raises(ValueError, match="a judge sees whole episodes"):
@@ -157,7 +155,7 @@ def test_a_group_of_equal_clips_has_no_head_room_and_one_of_different_clips_what
     found = measure_headroom(folder, recorded(), silent, probe)
     assert [one.clips for one in found] == [1, 2, 3, 4]
     for one in found:
-        assert one.gain == pytest.approx((0, 0, 0), abs=1e-9) and one.spread == pytest.approx(0, abs=1e-9)
+        assert one.gain == pytest.approx((0, 0, 0), abs=1e-9)
         assert one.share == pytest.approx(0, abs=1e-6) and one.codec > one.reward
     source = make_source()
     for one in measure_headroom(folder, recorded(), CONFIG, probe):
@@ -170,7 +168,7 @@ def test_a_group_of_equal_clips_has_no_head_room_and_one_of_different_clips_what
 
 
 def test_a_gain_is_weighed_against_what_is_missing_to_the_codec() -> None:
-    one = Headroom(2, 0.5, 0.52, (0.02, 0.01, 0.03), 0.01, 0.7, (0, 0, 0), (0, 0, 0))
+    one = Headroom(2, 0.5, 0.52, (0.02, 0.01, 0.03), 0.7)
     assert one.share == pytest.approx(0.15) and replace(one, codec=0.5).share == 0
 
 

@@ -79,16 +79,12 @@ def _print_headroom(
     frames = sample_by_ode(folder, clips, config, config.rollout.num_steps)
     drift = {name: float(values.mean()) for name, values in horizon_scores(frames, clips, probe, folder).items()}
     columns = (
-        "clip", "reward", "best of n", "gain", "object, cm less", "tool, cm less", "std in a group", "codec",
-        "of the gap, at most",
-        *(f"rollout {name}" for name in DRIFT),
+        "clip", "reward", "best of n", "gain", "codec", "of the gap, at most", *(f"rollout {name}" for name in DRIFT)
     )
     rows = (
         (
-            str(h.clips), f"{h.reward:.3f}", f"{h.best:.3f}", estimate(h.gain, ".3f"), estimate(h.object_cm, ".2f"),
-            estimate(h.tool_cm, ".2f"), f"{h.spread:.3f}", f"{h.codec:.3f}",
-            f"{h.share:.0%}",
-            *(f"{drift[f'{name}_{h.clips}']:.2f}" for name in DRIFT),
+            str(h.clips), f"{h.reward:.3f}", f"{h.best:.3f}", estimate(h.gain, ".3f"), f"{h.codec:.3f}",
+            f"{h.share:.0%}", *(f"{drift[f'{name}_{h.clips}']:.2f}" for name in DRIFT),
         )
         for h in found
     )

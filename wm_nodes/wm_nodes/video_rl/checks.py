@@ -68,8 +68,12 @@ def examine(
     model.eval()
     buffer = sample_buffer(model, config, condition, noise, seeds, group, videos, 0, 0)
     sampled, trainable = buffer.rollout, [p.requires_grad for p in model.parameters()]
-    if not bool(sampled.latents.isfinite().all()):
-        return [_report_not_finite(sampled)]
+    broken = (~sampled.latents.isfinite()).flatten(1).any(1)
+    if bool(broken.any()):
+        return [CheckResult(
+            "sampled videos are finite", False, f"{int(broken.sum())} of {len(broken)} are not",
+            "float16 overflows where bfloat16 does not; check the weights, and the latents' scale",
+        )]
     try:
         learner = GrpoLearner(model, _without_updates(config.grpo, rollout), rollout, seed=config.seed)
         first = _check_first_update(learner, buffer)
@@ -84,14 +88,6 @@ def examine(
         _check_mask(sampled, condition.num_conditioning, rollout),
         _check_round_trip(buffer),
     ]
-
-
-def _report_not_finite(sampled: VideoRollout) -> CheckResult:
-    broken = int((~sampled.latents.isfinite()).flatten(1).any(1).sum())
-    return CheckResult(
-        "sampled videos are finite", False, f"{broken} of {len(sampled.latents)} are not",
-        "float16 overflows where bfloat16 does not; check the weights, and the latents' scale",
-    )
 
 
 def _check_ode(

@@ -49,8 +49,6 @@ class RecordedClips:
     """By name, float64 (N,), NaN where missing."""
     total: Tensor
     """What trains, float64 (N,), NaN where missing."""
-    valid: Tensor
-    """bool (N,)."""
     picture: UInt8Array | None
     """uint8 (N H, F W, 3), or None where not read."""
     weights: Mapping[str, float] = field(default_factory=dict)
@@ -85,7 +83,7 @@ class Rescored:
     total: Tensor
     """Of now."""
     different: tuple[str, ...]
-    """Names of scores, `total`, `valid` or `verdicts` whose bits are not the recorded ones."""
+    """Names of scores, `total` or `verdicts` whose bits are not the recorded ones."""
     same_reward: bool = True
     """The total was recorded with the same rewards; else it is not compared."""
     verdicts: tuple[Mapping[str, Any], ...] = ()
@@ -192,13 +190,12 @@ def rescore(recorded: RecordedClips, source: RecordedContexts, judge: BufferJudg
     if unknown:
         raise BagError(f"{', '.join(unknown)} cannot be scored again from pictures; only {', '.join(scores)} can")
     total = mix_rewards(scores, rewards)
-    valid = torch.isfinite(total)
-    total = torch.where(valid, total, torch.nan)
+    total = torch.where(torch.isfinite(total), total, torch.nan)
     weighted, weighted_now = ({n for n, weight in weights.items() if weight} for weights in (recorded.weights, rewards))
     same_reward = weighted == weighted_now
     pairs = {name: (values, scores[name].double()) for name, values in recorded.scores.items() if name in scores}
     if same_reward:
-        pairs |= {"total": (recorded.total, total), "valid": (recorded.valid, valid)}
+        pairs["total"] = recorded.total, total
     ids, answered = recorded.audit_ids, torch.ones(len(total), dtype=torch.bool)
     if verdicts and ids:
         answered = torch.tensor([bool(audit_id) for audit_id in ids])
@@ -277,8 +274,8 @@ def _join_scores(batch: Any, scores: Any, picture: UInt8Array | None, audit_ids:
     contexts = torch.from_numpy(np.array(batch.contexts, np.int64)).repeat_interleave(int(batch.group_size))
     return RecordedClips(
         int(batch.iteration), int(batch.policy_version), contexts, int(batch.num_frames), batch.buffer_uri,
-        batch.sha256, dict(zip(scores.names, values, strict=True)), torch.where(valid, total, torch.nan), valid,
-        picture, dict(zip(scores.names, map(float, scores.weights), strict=True)), audit_ids,
+        batch.sha256, dict(zip(scores.names, values, strict=True)), torch.where(valid, total, torch.nan), picture,
+        dict(zip(scores.names, map(float, scores.weights), strict=True)), audit_ids,
     )
 
 

@@ -75,16 +75,19 @@ class RecordedContexts:
         probe: reads positions off the clips; None: they are sampled and not scored.
 
     Raises:
-        ValueError: groups.history of a model that makes other clips than the settings say, or of recordings that end
-            before; as load_execution_reward.
+        ValueError: groups.history of a model that makes whole episodes, or of recordings that end before; as
+            load_execution_reward.
     """
 
     def __init__(
         self, folder: VideoFolder, contexts: Clips, config: VideoRlConfig, probe: PositionProbe | None = None
     ) -> None:
         self.folder, self.contexts, self.config, self._probe = folder, contexts, config, probe
-        if config.groups.history:
-            self._check_lengths()
+        clips, frames = config.groups.history, contexts.frames.shape[1]
+        if clips and (wanted := self._made(clips + 1)) > frames:
+            raise ValueError(
+                f"{clips} clips and one more have {wanted} frames, the recordings {frames}; lower groups.history"
+            )
         self.execution = None if probe is None else load_execution_reward(config, folder, contexts, probe)
 
     @property
@@ -179,19 +182,6 @@ class RecordedContexts:
                 "train a model of the preset closed_loop"
             )
         return self.folder.lengths
-
-    def _check_lengths(self) -> None:
-        lengths, training, history = self._lengths(), self.config.model.training, self.config.groups.history
-        if (lengths.given, lengths.new) != (training.given_frames, training.new_frames):
-            raise ValueError(
-                f"this video model goes on from {lengths.given} frames with {lengths.new} new ones, the settings say "
-                f"{training.given_frames} and {training.new_frames}; set model.training.given_frames and new_frames"
-            )
-        frames, wanted = self.contexts.frames.shape[1], self._made(history + 1)
-        if wanted > frames:
-            raise ValueError(
-                f"{history} clips and one more have {wanted} frames, the recordings {frames}; lower groups.history"
-            )
 
 
 def sample_by_ode(folder: VideoFolder, contexts: Clips, config: VideoRlConfig, num_steps: int) -> Tensor:

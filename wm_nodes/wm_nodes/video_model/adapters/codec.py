@@ -1,16 +1,15 @@
-"""Camera frames to latents and back, through the VAE of a public model.
+"""Camera frames to latents and back, through the VAE of a public model; instructions to the tokens it attends to.
 
 Shapes: B batch, N camera frames, H W camera pixels, C latent channels, h w latent grid, F = 1 + (N - 1) / 4 latent
-frames.
+frames, L tokens, E values.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
 from torch import Tensor
-
-from wm_nodes.video_model.adapters.text import visiting
 
 
 class VideoCodec:
@@ -71,3 +70,39 @@ class VideoCodec:
             raise ValueError(
                 f"this VAE takes 1 + {each} n frames of sides that are multiples of {side}, got {N} frames of {H}x{W}"
             )
+
+
+class TextEncoder:
+    """The way of a diffusers pipeline from prompts to tokens, padded to `max_tokens`, because the models attend to
+    padding.
+
+    Args:
+        pipeline: with tokenizer and text encoder.
+        device: where it computes. offload: the encoder rests on the CPU and visits the device for each call.
+    """
+
+    def __init__(
+        self, pipeline: Any, *, device: str | torch.device = "cpu", offload: bool = False, max_tokens: int = 512
+    ) -> None:
+        pipeline.text_encoder.requires_grad_(False).eval()
+        self.pipeline, self.device, self.offload, self.max_tokens = pipeline, torch.device(device), offload, max_tokens
+
+    @torch.no_grad()
+    def encode(self, prompts: list[str]) -> Tensor:
+        """Return (B, L, E) on the device."""
+        with visiting(self.pipeline.text_encoder, self.device, self.offload):
+            text: Tensor = self.pipeline.encode_prompt(
+                prompts, do_classifier_free_guidance=False, max_sequence_length=self.max_tokens, device=self.device
+            )[0]
+        return text
+
+
+@contextmanager
+def visiting(module: Any, device: torch.device, offload: bool) -> Iterator[None]:
+    """Have a module on a device; offload: it goes back to the CPU afterwards."""
+    module.to(device)
+    try:
+        yield
+    finally:
+        if offload:
+            module.to("cpu")

@@ -10,9 +10,8 @@ from torch import Tensor, nn
 
 from wm_nodes.core.device import device_of
 from wm_nodes.core.model_folder import ModelFolderError, read_json
-from wm_nodes.video_model.adapters.codec import VideoCodec
+from wm_nodes.video_model.adapters.codec import TextEncoder, VideoCodec
 from wm_nodes.video_model.adapters.cosmos import CosmosVelocity
-from wm_nodes.video_model.adapters.text import TextEncoder
 from wm_nodes.video_model.adapters.velocity import PublicVelocity, package
 from wm_nodes.video_model.adapters.wan import WanVelocity
 from wm_nodes.video_model.conditions import Condition

@@ -1,4 +1,5 @@
-"""What all public models share: given frames, text and its absence, and the adapter that can be switched off.
+"""What all public models share: given frames, text and its absence, and a low-rank adapter on the attention, through
+peft, that can be switched off: then it is the base model, kl.anchor lora_off.
 
 Shapes: B batch, C channels, F latent frames, K given frames, H W latent grid, L text tokens of E values.
 """
@@ -7,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,6 +17,9 @@ from torch import Tensor, nn
 from wm_nodes.core.imports import optional_package
 from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.kernels import with_conditioning
+
+TARGETS = ("to_q", "to_k", "to_v", "to_out.0")
+"""Attention projections of Wan's and Cosmos's blocks."""
 
 package = partial(optional_package, needed_by="public video models need", requirements="video.txt")
 
@@ -110,3 +115,33 @@ def tuner_layers(model: nn.Module) -> list[Any]:
         return []
     base = package("peft.tuners.tuners_utils").BaseTunerLayer
     return [module for module in model.modules() if isinstance(module, base)]
+
+
+def add_lora(model: PublicVelocity, rank: int, alpha: float | None = None, *, seed: int = 0) -> None:
+    """Add an adapter in place, which starts as no change; it alone trains afterwards, in float32.
+
+    Args:
+        alpha: the adapter is scaled by alpha / rank; None: 1.
+        seed: of its first weights.
+    """
+    if rank < 1:
+        raise ValueError(f"lora.rank must be >= 1, got {rank}")
+    if tuner_layers(model):
+        raise ValueError("this model has a LoRA adapter already")
+    config = package("peft").LoraConfig(
+        r=rank, lora_alpha=rank if alpha is None else alpha, target_modules=list(TARGETS), lora_dropout=0.0
+    )
+    with torch.random.fork_rng(devices=[]):  # the weights are drawn on the CPU, then moved
+        torch.manual_seed(seed)
+        model.transformer.add_adapter(config)
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad_("lora_" in name)
+        if "lora_" in name:
+            parameter.data = parameter.data.float()
+
+
+def save_lora(model: PublicVelocity, folder: Path) -> None:
+    """Write the adapter as safetensors that diffusers' pipelines load too (load_lora_adapter)."""
+    if not tuner_layers(model):
+        raise ValueError("this model has no LoRA adapter to save")
+    model.transformer.save_lora_adapter(folder, safe_serialization=True)
