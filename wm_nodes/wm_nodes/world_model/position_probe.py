@@ -20,12 +20,43 @@ HIDDEN = 128
 BATCH = 256
 
 
-class PositionProbe(nn.Module):
+class PictureReader(nn.Module):
+    """A network that reads values off pictures of the cameras that it was trained on, of any size."""
+
+    def __init__(self, height: int, width: int) -> None:
+        super().__init__()
+        self.height, self.width = height, width
+
+    @torch.inference_mode()
+    def read_values(self, images: UInt8Array | Tensor) -> Tensor:
+        """What forward gives for each of uint8 images (..., H, W, 3), (N, ...), N all of them.
+
+        Raises:
+            ValueError: images of another shape.
+        """
+        tensor = torch.as_tensor(images)
+        H, W, channels = tensor.shape[-3:]
+        if channels != 3 or H * self.width != W * self.height:
+            raise ValueError(
+                f"images must be (..., {self.height}, {self.width}, 3) or enlarged, got {tuple(tensor.shape)}; the "
+                f"{type(self).__name__} was trained for another camera set-up, see the model folder's manifest"
+            )
+        parts = torch.split(tensor.reshape(-1, H, W, 3), BATCH)  # type: ignore[no-untyped-call]
+        return torch.cat([self(self.pixels(part)) for part in parts])
+
+    def pixels(self, images: Tensor) -> Tensor:
+        """Float (B, 3, height, width) in [0, 1]."""
+        pixels = images.permute(0, 3, 1, 2).to(next(self.parameters()).device).float() / 255
+        if tuple(pixels.shape[2:]) == (self.height, self.width):
+            return pixels
+        return interpolate(pixels, (self.height, self.width), mode="bilinear", antialias=True)
+
+
+class PositionProbe(PictureReader):
     """A small convolutional regressor, without pooling, so that places stay places."""
 
     def __init__(self, height: int, width: int, num_positions: int = NUM_POSITIONS) -> None:
-        super().__init__()
-        self.height, self.width = height, width
+        super().__init__(height, width)
         layers, values = halving_convolutions(CHANNELS, height, width)
         self.features = nn.Sequential(*layers)
         self.regress = nn.Sequential(nn.Linear(values, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, num_positions))
@@ -39,31 +70,11 @@ class PositionProbe(nn.Module):
         out: Tensor = self.regress(self.features(2 * pixels_B3HW - 1))
         return out
 
-    @torch.inference_mode()
     def read(self, images: UInt8Array | Tensor) -> FloatArray:
-        """Positions (..., P), m, of uint8 images (..., H, W, 3) of the cameras that it was trained on, of any size.
-
-        Raises:
-            ValueError: images of another shape.
-        """
-        tensor = torch.as_tensor(images)
-        H, W, channels = tensor.shape[-3:]
-        if channels != 3 or H * self.width != W * self.height:
-            raise ValueError(
-                f"images must be (..., {self.height}, {self.width}, 3) or enlarged, got {tuple(tensor.shape)}; the "
-                "probe was trained for another camera set-up, see the model folder's manifest.json"
-            )
-        flat = tensor.reshape(-1, H, W, 3)
-        parts = [self(self._pixels(flat[i : i + BATCH])) * self.std + self.mean for i in range(0, len(flat), BATCH)]
-        positions: FloatArray = torch.cat(parts).cpu().numpy().reshape(*tensor.shape[:-3], -1).astype(np.float32)
-        return positions
-
-    def _pixels(self, images: Tensor) -> Tensor:
-        """Float (B, 3, height, width) in [0, 1]."""
-        pixels = images.permute(0, 3, 1, 2).to(self.mean.device).float() / 255
-        if tuple(pixels.shape[2:]) == (self.height, self.width):
-            return pixels
-        return interpolate(pixels, (self.height, self.width), mode="bilinear", antialias=True)
+        """Positions (..., P), m, of uint8 images (..., H, W, 3). Raises ValueError as read_values."""
+        positions = self.read_values(images) * self.std + self.mean
+        found: FloatArray = positions.cpu().numpy().reshape(*images.shape[:-3], -1).astype(np.float32)
+        return found
 
 
 def halving_convolutions(channels: Sequence[int], height: int, width: int) -> tuple[list[nn.Module], int]:
