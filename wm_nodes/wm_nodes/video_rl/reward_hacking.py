@@ -29,15 +29,8 @@ def find_hacked_metrics(
 
     Args:
         proxy: the training reward at each evaluation. held_out: true metrics at the same ones, more is better.
-
-    Raises:
-        ValueError: fewer than three evaluations in the window, or curves of different lengths.
+        window: at least 3.
     """
-    if window < 3:
-        raise ValueError(f"window must be >= 3 evaluations, got {window}")
-    for name, values in held_out.items():
-        if len(values) != len(proxy):
-            raise ValueError(f"{name} has {len(values)} evaluations, the training reward {len(proxy)}")
     if len(proxy) < window:
         return {}
     widths = T_975[min(window - 2, len(T_975)) - 1]
