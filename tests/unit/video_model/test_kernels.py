@@ -35,7 +35,7 @@ from wm_nodes.video_model import (
     step,
 )
 from wm_nodes.video_model.kernels import SIGMA_LIMIT, with_conditioning
-from wm_nodes.video_rl.grpo_math import gaussian_logprob
+from wm_nodes.video_rl.ratio_and_kl import gaussian_logprob
 
 BIG = (1, 4, 8, 16, 16)
 """D = 8192."""

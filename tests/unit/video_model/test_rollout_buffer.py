@@ -35,7 +35,7 @@ from wm_nodes.video_model import (
     transition,
 )
 from wm_nodes.video_model.sampling import normalised_noise
-from wm_nodes.video_rl.grpo_math import log_ratio, mean_kl
+from wm_nodes.video_rl.ratio_and_kl import log_ratio, mean_kl
 
 WIDE = (8, 5, 16, 16)
 """D = 8192 with one given frame."""

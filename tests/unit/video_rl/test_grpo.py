@@ -34,8 +34,7 @@ from wm_nodes.training.weights import WeightsError
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError, StepContext, VideoNetwork, step
 from wm_nodes.video_rl.group_advantages import GroupAdvantages
 from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner
-from wm_nodes.video_rl.grpo_math import gaussian_logprob
-from wm_nodes.video_rl.ratio_and_kl import Rows
+from wm_nodes.video_rl.ratio_and_kl import Rows, gaussian_logprob
 
 NO_KL = kl_config(beta=0.0)
 MODES = ["mean", "logk2"]

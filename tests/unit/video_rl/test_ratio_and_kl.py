@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from video_toys import randn
 
 from wm_nodes.video_rl.group_advantages import GroupAdvantages, best_of_n, group_advantages
-from wm_nodes.video_rl.grpo_math import (
+from wm_nodes.video_rl.ratio_and_kl import (
     clip_tails,
     clipped_objective,
     gaussian_logprob,
