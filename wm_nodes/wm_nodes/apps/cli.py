@@ -62,6 +62,7 @@ GROUPS = {
     "benchmarks, where the repository is": {
         "benchmark speed": "graph, world model and simulator, side by side",
         "benchmark device-speed": "what a GPU makes of both loops",
+        "benchmark view": "CPU time that the live page costs the other nodes",
         "benchmark trained-in": "policies trained in each model, measured in the simulator",
         "benchmark ranking": "imagined success of policies against their real success",
         "benchmark disc-base": "the video model that experiments on the moving disc begin with",
