@@ -43,7 +43,7 @@ class Observed:
 
     image: uint8 (H, W, 3), cameras side by side. state: float32 (S,), where there is one. latents: float32 (F,), those
     of the picture's encoding. positions: float32 (P,), those of object, tool and goal, or of all ground truth,
-    that the tokenizer's probe reads, shifted and scaled to the spread of its training data; privileged, as the probe
+    that the tokenizer's probe reads, shifted and scaled to the spread of its training data; privileged where the probe
     learned them from a simulator.
 
     Args:
@@ -112,7 +112,7 @@ class ImaginedVectorEnv(VectorEnv[dict[str, Any], FloatArray, NDArray[Any]]):
         task: None: that of the model, where it is a task of ours.
         starts: file of the frames that episodes begin at; empty: the model's.
         observations: names of image, state, latents, positions, see Observed. examples/imagined_ppo.py learns from
-            latents in two minutes; with a convolutional network on pictures it did not in as many steps.
+            latents in minutes; a convolutional network on pictures, from nothing, did not.
         preset, settings: as load_config takes them, e.g. {"reward.success_threshold": 0.5, "device": "cuda"}.
         autoreset_mode: SAME_STEP: a step that ends an episode shows the first observation of the next one, and infos
             has final_obs and final_info; DISABLED: reset(options={"reset_mask": bool (N,)}) begins anew.
