@@ -1,7 +1,7 @@
 """A video model's clips as episodes that train a policy: no demonstration is needed.
 
     wm follow-clips runs/RUN --out BAG [--episodes 200]
-    wm train-policy --task push_cube --demos BAG --sft.num_demonstrations 200
+    wm train-policy --task TASK --demos BAG --sft.num_demonstrations 200
 
 RUN is one of train-video-model, best with --preset outcome --reward execution. Its video model makes a clip from the
 first frame of each of the run's training recordings, and another of each while episodes are missing. The action world
