@@ -88,10 +88,12 @@ def accepted_episodes(reward: ExecutionReward, frames: Tensor, references: Clips
     shown, states = [references.frames[:, 0].cpu().numpy()], [references.first_states()]
     actions, signals = list[FloatArray](), list[FloatArray]()
     for step in reward.follow(reward.paths(frames, references), references):
-        for values, now in ((shown, step.arm.frames_NHWC), (states, step.arm.states_NP),
-                            (actions, step.actions_NA), (signals, step.signal_N)):
-            values.append(now.cpu().numpy().copy())
-    images_NT, states_NT, actions_NT, signals_NT = (np.stack(some, 1) for some in (shown, states, actions, signals))
+        shown.append(step.arm.frames_NHWC.cpu().numpy().copy())
+        states.append(step.arm.states_NP.cpu().numpy().copy())
+        actions.append(step.actions_NA.cpu().numpy())
+        signals.append(step.signal_N.cpu().numpy())
+    images_NT = np.stack(shown, 1)
+    states_NT, actions_NT, signals_NT = (np.stack(some, 1) for some in (states, actions, signals))
     done_NT = signals_NT > reward.threshold
     episodes = list[Episode]()
     for row in np.flatnonzero(done_NT.any(1)).tolist():
