@@ -18,7 +18,7 @@ STORE = get_typestore(Stores.ROS2_JAZZY)
 BEGIN_NS = 1_700_000_000 * 10**9
 MS = 10**6
 FRONT, WRIST, JOINTS = "/front/image_raw/compressed", "/wrist/image_raw", "/joint_states"
-WIDTH, TWIST, GRIPPER = "/gripper/width", "/servo/delta_twist_cmds", "/gripper/command"
+WIDTH, TWIST, GRIPPER, POSE = "/gripper/width", "/servo/delta_twist_cmds", "/gripper/command", "/cup/pose"
 EXAMPLE = Path(package).with_name("example.yaml")
 
 Message = tuple[int, str, Any]
@@ -59,6 +59,13 @@ def twist(time_ns: int, x: float, y: float) -> Any:
     vector = STORE.types["geometry_msgs/msg/Vector3"]
     parts = message("geometry_msgs/msg/Twist", linear=vector(x=x, y=y, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0))
     return message("geometry_msgs/msg/TwistStamped", header=header(time_ns), twist=parts)
+
+
+def pose(time_ns: int, x: float, y: float) -> Any:
+    position = message("geometry_msgs/msg/Point", x=x, y=y, z=0.0)
+    orientation = message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+    one = message("geometry_msgs/msg/Pose", position=position, orientation=orientation)
+    return message("geometry_msgs/msg/PoseStamped", header=header(time_ns), pose=one)
 
 
 def numbers(*values: float) -> Any:
@@ -111,6 +118,7 @@ class Run:
                 place = np.clip(place + 0.05 * velocity, -1, 1)
                 if step % 2 == 0:
                     add(time_ns, JOINTS, joint_state(time_ns, j2=float(place[1]), j1=float(place[0]), other=9.0))
+                    add(time_ns, POSE, pose(time_ns, *place.tolist()))
                 if step % round(100 / self.camera_hz) == 0:
                     add(time_ns, FRONT, compressed(time_ns, seen(*place)))
                     add(time_ns, WRIST, image(time_ns, seen(*-place, 64, 64)[..., ::-1], "bgr8", padding=5))

@@ -1,5 +1,6 @@
 """World models of robots that the product does not know, from bags: states that are measured, commanded, or none."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import pytest
 import torch
 
 from examples import own_environment
-from wm_nodes.config.load import load_config
+from wm_nodes.config.load import ConfigError, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import EnvironmentSpec
@@ -28,6 +29,8 @@ from wm_nodes.world_model import (
     load_model_folder,
     save_model_folder,
 )
+from wm_nodes.world_model.folder import read_world_manifest
+from wm_nodes.world_model.validation.acceptance import report_when_made
 
 TINY = {
     "task": "", "tokenizer.width": 16, "tokenizer.patch_px": 8, "tokenizer.latent_dim": 8,
@@ -38,8 +41,9 @@ TINY = {
 NO_STATE = {"state_names": (), "state_units": ()}
 
 
-def record(folder: Path, count: int = 12, **changes: Any) -> Path:
-    """A bag of random episodes of the arm, of what `changes` of its spec leave of the state."""
+def record(folder: Path, count: int = 12, instructions: Sequence[str] = (), **changes: Any) -> Path:
+    """A bag of random episodes of the arm, of what `changes` of its spec leave of the state. instructions: of the
+    episodes in turn; none: that of the spec."""
     arm = EnvironmentBatch(own_environment.SPEC, [own_environment.Arm()], 0)
     spec = replace(arm.spec, **changes)
     stream = numpy_stream(0, "random actions")
@@ -57,7 +61,8 @@ def record(folder: Path, count: int = 12, **changes: Any) -> Path:
             bag.write(Episode(
                 np.stack([one.image[0] for one in shown]), np.stack([one.state[0, : spec.state_dim] for one in shown]),
                 np.concatenate(actions), np.zeros((steps + 1, 0), np.float32), np.array(won),
-                np.zeros(steps, np.float32), bool(won[-1]), not won[-1], spec.task, spec.instruction, "random", number,
+                np.zeros(steps, np.float32), bool(won[-1]), not won[-1], spec.task,
+                instructions[number % len(instructions)] if instructions else spec.instruction, "random", number,
                 number + 1, spec.source,
             ))
     return folder
@@ -104,6 +109,34 @@ def test_a_policy_scales_measured_states_by_what_was_recorded(config: RunConfig,
     torch.testing.assert_close(policy.state_shift_S, recorded.state_mean)
     torch.testing.assert_close(policy.state_scale_S, recorded.state_scale)
     assert 0.3 < float(policy.state_scale_S.min()) < float(policy.state_scale_S.max()) < 1.5
+
+
+def test_where_instructions_differ_goals_are_imagined_by_those_of_the_recordings(
+    config: RunConfig, tmp_path: Path
+) -> None:
+    bag = record(tmp_path / "bag", instructions=("touch the post", "reach the post"))
+    folder = model_of(bag, config, tmp_path)
+    models = load_model_folder(folder)
+    assert models.text is not None
+    assert models.text.condition.vocabulary == ("post", "reach", "the", "touch")
+    heldout = read_world_manifest(folder)["heldout"]
+    assert heldout["goal_episodes"] > 0 and heldout["goal_left_out"] == 0 and heldout["goal_perceptual_copy"] > 0
+    rewarded = config.with_values(reward=config.reward.with_values(dense_weight=1.0))
+    names = [row.name for row in report_when_made(read_world_manifest(folder), rewarded).criteria]
+    assert "imagined goal of touch_the_post: perceptual error / first frame" in names
+    imagined = make_imagined_environment(rewarded, folder, folder / STARTS, num_envs=2, seed=0)
+    imagined.reset()
+    goals = imagined.goals()
+    assert goals is not None and goals[0].shape == (2, 72, 96, 3)
+
+
+def test_goals_that_the_reward_asks_for_need_an_instruction_that_can_be_read(config: RunConfig, tmp_path: Path) -> None:
+    bag = record(tmp_path / "bag", instructions=("touch the post " * 5, "touch it"))
+    rewarded = config.with_values(reward=config.reward.with_values(dense_weight=1.0))
+    with pytest.raises(ConfigError, match=r"imagined goals, but instruction 'touch .* has 15 words, and 1 to 12"):
+        model_of(bag, rewarded, tmp_path)
+    assert not (tmp_path / "metrics.jsonl").exists()  # nothing was trained before
+    assert load_model_folder(model_of(bag, config, tmp_path)).text is None
 
 
 def mixed() -> EnvironmentSpec:

@@ -79,7 +79,7 @@ def test_a_long_episode_is_cut_in_parts_that_hold_every_step_and_stay_on_one_sid
 
 def test_several_instructions_are_said_to_be_unread(tmp_path: Path) -> None:
     bag = write(tmp_path / "bag", episodes(change=lambda e: replace(e, instruction=f"stir pot {e.episode_id % 2}")))
-    assert any(line.startswith("2 instructions, which this model does not read") for line in read(bag).summary)
+    assert any(line.startswith("2 instructions: goals follow them") for line in read(bag).summary)
 
 
 def test_what_a_live_recording_lost_is_said_with_its_reason_and_success_is_the_flag_without_ground_truth(

@@ -5,6 +5,8 @@
 
 A quarter of the episodes is held out, and the model is judged by rollouts of them. FOLDER/model/acceptance.json says
 what passed, what failed, and what could not be judged. The folder alone goes on with a training that was interrupted.
+Where instructions differ, or with --reward.dense_weight 1, it imagines goals, too, learned from the episodes that
+succeed.
 """
 
 import argparse

@@ -247,7 +247,8 @@ class PpoLearner:
         chosen = valid_TN.reshape(-1).nonzero().squeeze(1)
         if not len(chosen):
             what = "valid transition: no valid reward or step" if groups is None else "first episode with every reward"
-            raise ValueError(f"the rollout has no {what}; see the reward's reason")
+            raise ValueError(f"the rollout has no {what}; the rewards in the run's bag say why (`reason`): with "
+                             "reward.dense_weight that no goal was imagined, and 0 pays success alone")
         known_TN = torch.isfinite(rollout.logprobs_TN)
         if groups is None:
             known_TN &= torch.isfinite(rollout.values_TN)

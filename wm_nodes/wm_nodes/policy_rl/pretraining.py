@@ -42,12 +42,13 @@ from wm_nodes.world_model import ActionModel, Tokenizer, WorldModels, load_model
 from wm_nodes.world_model.folder import action_model_class
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.sentence_encoder import SentenceEncoder
+from wm_nodes.world_model.text import MAX_WORDS, task_instruction
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.training.decoder import train_decoder
 from wm_nodes.world_model.training.dynamics import LatentEpisodes, tokenise_episodes, train_action_model
 from wm_nodes.world_model.training.position_probe import train_position_probe
 from wm_nodes.world_model.training.state_probe import train_state_probe
-from wm_nodes.world_model.training.text import demonstrators, train_text_model
+from wm_nodes.world_model.training.text import demonstrators, golden_rows, train_text_model
 from wm_nodes.world_model.training.token_dynamics import train_token_model
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
 from wm_nodes.world_model.validation.acceptance import model_metrics
@@ -160,8 +161,8 @@ def model_from_data(
     """Train tokenizer and action model on the recorded episodes of one environment, whichever it is, and measure them
     on those held out; returns the folder, with first frames to imagine from. Checkpoints and metrics lie beside it.
 
-    Success is the task's rule, or without a task file the recorded flag. There is no text model, so no goals: set
-    reward.dense_weight to 0.
+    Success is the task's rule, or without a task file the recorded flag. A text model, for goals, is trained where
+    instructions differ, or reward.dense_weight is not 0; it learns from the recordings that succeed.
 
     Args:
         starts: the first frames, as read_recordings gives them.
@@ -171,6 +172,7 @@ def model_from_data(
     spec = data.spec
     for line in data.summary:
         say(line)
+    has_goals = _has_goals(data, config, say)
     say(f"tokenizer, {config.tokenizer.num_iterations} iterations")
     with explain_memory(device, tokenizer__batch_size=config.tokenizer.batch_size):
         tokenizer, tokenizer_metrics = train_tokenizer(data.training, config, config.seed, run_dir)
@@ -184,20 +186,51 @@ def model_from_data(
     with explain_memory(device, world_model__batch_size=config.world_model.batch_size):
         latents = tokenise_episodes(tokenizer, data.training)
         action, shown_by, dynamics_metrics = _train_dynamics(tokenizer, latents, spec, config, run_dir)
+        text, text_metrics = None, dict[str, float]()
+        if has_goals and isinstance(action, ActionModel):
+            say(f"text model, {config.world_model.text_num_iterations} iterations")
+            text, text_metrics = train_text_model(
+                tokenizer, action, data.training, latents, [task_instruction(task, spec) for task in data.tasks],
+                config, config.seed, run_dir,
+            )
     say(f"rollouts of {len(data.heldout)} held-out episodes or parts of them")
-    models = WorldModels(shown_by, action, None, data.tasks, tool_spec(spec), {}, probe)
+    models = WorldModels(shown_by, action, text, data.tasks, tool_spec(spec), {}, probe)
+    goals = goal_metrics(models, data.heldout, config, data.tasks[0])
     story = {
         "made": _made(command, config),
         "data": {"episodes": data.num_episodes, "summary": list(data.summary)},
         "success_threshold": config.reward.success_threshold,
-        "training": {"tokenizer": tokenizer_metrics, **dynamics_metrics},
-        "heldout": plain(model_metrics(models, data.heldout, config)),
+        "training": {"tokenizer": tokenizer_metrics, **dynamics_metrics, "text": text_metrics},
+        "heldout": plain(model_metrics(models, data.heldout, config) | goals),
     }
     write_atomic(folder / STARTS, save(starts))
     return save_model_folder(
-        folder, tokenizer, action, None, config, spec=spec, tasks=data.tasks, story=story, probe=probe,
+        folder, tokenizer, action, text, config, spec=spec, tasks=data.tasks, story=story, probe=probe,
         decoder=shown_by.decoder if shown_by is not tokenizer else None,
     )
+
+
+def _has_goals(data: TrainingData, config: RunConfig, say: Callable[[str], object]) -> bool:
+    """Whether a text model is trained: where instructions differ, or the reward asks for goals.
+
+    Raises:
+        ConfigError: the reward asks for goals, and the recordings cannot show them.
+    """
+    texts, is_asked_for = {*data.training.instructions}, config.reward.dense_weight > 0
+    if config.tokenizer.kind == "lfq" or not (is_asked_for or len(texts) > 1):
+        return False
+    wrong = [text for text in texts if not 0 < len(text.split()) <= MAX_WORDS]
+    if wrong and not config.world_model.text_encoder:
+        reason = (f"instruction {wrong[0]!r} has {len(wrong[0].split())} words, and 1 to {MAX_WORDS} are read; change "
+                  "it, or name a sentence encoder with world_model.text_encoder")
+    elif not len(golden_rows(data.training)):
+        reason = "no episode that is trained on succeeds after its first frame; record more successes"
+    else:
+        return True
+    if is_asked_for:
+        raise ConfigError(f"reward.dense_weight {config.reward.dense_weight:g} asks for imagined goals, but {reason}")
+    say(f"no imagined goals: {reason}")
+    return False
 
 
 def _train_dynamics(

@@ -177,7 +177,7 @@ def _used(
     if long := [len(of_one) for of_one in parts if len(of_one) > 1]:
         yield f"{_count(len(long), 'long episode')} in {sum(long)} parts, with every step"
     if len(texts := {episode.instruction for episode in episodes}) > 1:
-        yield f"{len(texts)} instructions, which this model does not read: it has no goals that they describe"
+        yield f"{len(texts)} instructions: goals follow them; the done signal and the policy do not read them"
 
 
 def _count(number: int, thing: str) -> str:

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from wm_nodes.config.schema import WorldModelConfig
-from wm_nodes.config.tasks import parts_of
+from wm_nodes.config.tasks import get_task, parts_of, task_names
+from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import BoolArray, UInt8Array
 from wm_nodes.world_model.conditions import text_rows, word_mask
 from wm_nodes.world_model.dynamics import FrameModel, Prediction, task_done_signal
@@ -88,6 +89,11 @@ def instruction_for(task: str, recorded_task: str, own: str, otherwise: str) -> 
     """The instruction of an episode for `task`: its own where it was recorded for that task and has one, else that of
     the task, `otherwise`."""
     return own if own and recorded_task in (task, *parts_of(task)) else otherwise
+
+
+def task_instruction(task: str, spec: EnvironmentSpec) -> str:
+    """Of the task's file, or of the environment where it has none."""
+    return get_task(task).instruction if task in task_names() else spec.instruction
 
 
 def vocabulary_of(instructions: tuple[str, ...]) -> tuple[str, ...]:

@@ -66,6 +66,7 @@ def one_topic(path: Path, messages: list[Message], **changes: Any) -> list[Episo
     (path / "labels.csv").write_text("bag,start_s,end_s,success\nbag,,,1\n")
     fixed = {
         "timeline": "header", "observations__images__wrist": None, "observations__state__1": None, "actions__1": None,
+        "probes": None,
         "episodes__split": {"per": "bag"}, "episodes__success": {"file": "labels.csv"}, "episodes__min_steps": 1,
     }
     return imported([path / "bag"], contract_file(path / "contract.yaml", **{**fixed, **changes}), path / "out")
@@ -125,12 +126,13 @@ def test_a_foreign_bag_becomes_a_world_model(tmp_path: Path, capsys: pytest.Capt
     assert (spec.cameras, spec.height, spec.width, spec.source) == (("front", "wrist"), 64, 128, SOURCE_REAL)
     assert spec.state_names == ("position.j1", "position.j2", "gripper.width") and spec.measured == (0, 1, 2)
     assert spec.action_scale == pytest.approx((0.1, 0.1, 0.04)) and spec.control_period_s == 0.1
-    assert spec.max_episode_steps == 20
+    assert spec.max_episode_steps == 20 and spec.ground_truth_names == ("pose.position.x", "pose.position.y")
     assert {episode.instruction for episode in episodes} == {"pick up the cup"}
     with Bag(out) as bag:
         assert "lab/my_arm" in bag.custom["wm.contract_yaml"] and "images.front" in bag.custom["wm.import_table"]
     arrays = stack_episodes(episodes, (spec.task,), num_steps=spec.max_episode_steps)
     assert arrays.images.shape == (8, 21, 64, 128, 3)
+    np.testing.assert_array_equal(arrays.ground_truth, arrays.states[..., :2])  # the cup is where the joints are
     assert arrays.success[:, -1, 0].tolist() == [True, False] * 4
     torch.set_num_threads(1)
     config = load_config("smoke", TINY)

@@ -12,6 +12,7 @@ from foreign_robot import (
     FRONT,
     JOINTS,
     MS,
+    POSE,
     TWIST,
     WRIST,
     Message,
@@ -41,6 +42,7 @@ CONTRACTS: list[tuple[dict[str, Any], str]] = [
     ({"observations__state__0__names": ["a"]}, "/joint_states selects 2 values, but has {'names': 1}"),
     ({"observations__state__1__names": ["position.j1"]}, "several state values are called position.j1"),
     ({"observations__state__1__names": ["gripper_target"]}, "called gripper_target, but 'target' means commanded"),
+    ({"probes__0__names": ["x", "x"]}, "several probe values are called x"),
     ({"actions__0__low": [0.2, 0.2]}, "must be below high"),
     ({"actions__0__high": [0.2]}, "selects 2 values, but has {'high': 1}"),
     ({"actions__0__relative_to": "state"}, "relative to the state, which has no twist.linear.x"),
@@ -110,6 +112,8 @@ COLOURS = np.zeros((64, 64, 3), np.uint8)
 BAGS: dict[str, tuple[Change | None, dict[str, Any], str]] = {
     "missing topic": (without(WRIST), {}, "images.wrist: no message on /wrist/image_raw; topics of "
                       "sensor_msgs/msg/Image: none"),
+    "missing probe": (without(POSE), {}, "probes.0: no message on /cup/pose; topics of "
+                      "geometry_msgs/msg/PoseStamped: none"),
     "misspelt topic": (None, {"observations__state__0__topic": "/joint_state"},
                        "state.0: no message on /joint_state; topics of sensor_msgs/msg/JointState: /joint_states"),
     "wrong type": (None, {"actions__0__type": "geometry_msgs/msg/Twist"},

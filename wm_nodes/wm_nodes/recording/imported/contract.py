@@ -181,6 +181,9 @@ class Contract(SettingsSection):
     """What the policy sees."""
     actions: Annotated[tuple[Commands, ...], Field(min_length=1)]
     """What it commands, one after the other."""
+    probes: tuple[Numbers, ...] = ()
+    """Recorded values that the world model learns to read off its pictures, as the pose of a goal: so that small things
+    are not lost. Only training needs them; the policy never sees them."""
     beyond_limits: Literal["refuse", "clip"] = "refuse"
     """What is done with commands beyond low and high; clip: they become -1 or 1, and are counted."""
     episodes: EpisodeRules
@@ -195,6 +198,10 @@ class Contract(SettingsSection):
         return [name for source in self.actions for name in source.value_names]
 
     @property
+    def probe_names(self) -> list[str]:
+        return [name for source in self.probes for name in source.value_names]
+
+    @property
     def period_ns(self) -> int:
         return round(1e9 / self.rate_hz)
 
@@ -204,6 +211,7 @@ class Contract(SettingsSection):
         read: dict[str, Source] = {f"images.{name}": camera for name, camera in self.observations.images.items()}
         read |= {f"state.{number}": source for number, source in enumerate(self.observations.state)}
         read |= {f"actions.{number}": source for number, source in enumerate(self.actions)}
+        read |= {f"probes.{number}": source for number, source in enumerate(self.probes)}
         if rules.split.topic:
             read["split"] = Source(topic=rules.split.topic, type=BOOL)
         if rules.success.topic:
@@ -220,7 +228,9 @@ class Contract(SettingsSection):
         sizes = {name: camera.size for name, camera in self.observations.images.items()}
         if len(set(sizes.values())) > 1:
             raise ValueError(f"cameras have the sizes {sizes}; give all of them one size")
-        for kind, names in (("state", self.state_names), ("action", self.action_names)):
+        for kind, names in (
+            ("state", self.state_names), ("action", self.action_names), ("probe", self.probe_names)
+        ):
             if twice := {name for name in names if names.count(name) > 1}:
                 raise ValueError(f"several {kind} values are called {', '.join(sorted(twice))}; give them `names`")
         if wrong := [name for name in self.state_names if TARGET in name or name.startswith(TASK_PREFIX)]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.recording.errors import BagError
 from wm_nodes.recording.imported.contract import BOOL, Commands, Contract, InstructionTopic
-from wm_nodes.recording.imported.streams import Stream, Times
+from wm_nodes.recording.imported.streams import SAMPLED, Stream, Times
 from wm_nodes.recording.messages import NS_PER_S
 
 NEVER_NS = 2**63 - 1
@@ -51,6 +51,8 @@ class PlannedEpisode:
     """(T + 1, S)."""
     actions: FloatArray
     """(T, A), in [-1, 1]."""
+    probes: FloatArray
+    """(T + 1, P)."""
     success: BoolArray
     """(T + 1,)."""
     rewards: FloatArray
@@ -88,7 +90,7 @@ def spans_of(streams: Mapping[str, Stream], contract: Contract) -> list[Span]:
     split = contract.episodes.split
     commands = np.sort(np.concatenate([s.times for place, s in streams.items() if place.startswith("actions")]))
     if split.per:
-        used = [stream for place, stream in streams.items() if place.startswith(("images", "state", "actions"))]
+        used = [stream for place, stream in streams.items() if place.startswith(SAMPLED)]
         bounds = [(min(int(s.times[0]) for s in used), max(int(s.times[-1]) for s in used))]
     elif split.gap_s:
         cuts = np.flatnonzero(np.diff(commands) > split.gap_s * NS_PER_S)
@@ -121,9 +123,9 @@ class Planner:
         self, name: str, begun_ns: int, streams: Mapping[str, Stream], contract: Contract, tally: Tally
     ) -> None:
         self.name, self.begun_ns, self.streams, self.contract, self.tally = name, begun_ns, streams, contract, tally
-        self._images, self._state, self._actions = (
+        self._images, self._state, self._actions, self._probes = (
             [stream for place, stream in streams.items() if place.startswith(kind)]
-            for kind in ("images", "state", "actions")
+            for kind in SAMPLED
         )
         labels = contract.episodes.success.file
         self._labels = _labels_of(labels, name) if labels else ()
@@ -149,7 +151,8 @@ class Planner:
             return []
         seen, success = self._seen(ticks, has), self._success(ticks, span)
         joined = seen[:-1] & seen[1:] & has[:-1].all(1)
-        pictures, states = self._observations(ticks)
+        pictures = np.stack([stream.numbers[stream.newest(ticks)] for stream in self._images], 1)
+        states, probes = self._newest(self._state, ticks), self._newest(self._probes, ticks)
         commands = self._relative(commands, states)
         actions = self._scaled(commands)
         planned, covered = list[PlannedEpisode](), 0
@@ -162,8 +165,8 @@ class Planner:
             self._count_commands(actions[rows], commands[rows])
             planned.append(PlannedEpisode(
                 ticks[frames], pictures[frames], states[frames].astype(np.float32),
-                np.clip(actions[rows], -1, 1).astype(np.float32), success[frames], self._rewards(ticks[frames][1:]),
-                instruction,
+                np.clip(actions[rows], -1, 1).astype(np.float32), probes[frames].astype(np.float32), success[frames],
+                self._rewards(ticks[frames][1:]), instruction,
             ))
         tally.lost["in gaps and short stretches"] += len(joined) - covered
         if success[-1] and not (planned and planned[-1].ticks[-1] == ticks[-1]):
@@ -177,20 +180,21 @@ class Planner:
                            "recorded; set timeline to the other clock, or leave this bag out")
         return np.arange(span.start_ns, span.end_ns + 1, self.contract.period_ns, dtype=np.int64)
 
-    def _observations(self, ticks: Times) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """(K, V) the newest picture of each camera, and (K, S) the newest state."""
-        pictures = [stream.numbers[stream.newest(ticks)] for stream in self._images]
-        states = [stream.values[stream.newest(ticks)] for stream in self._state]
-        return np.stack(pictures, 1), np.concatenate([np.zeros((len(ticks), 0)), *states], 1)
+    @staticmethod
+    def _newest(streams: Sequence[Stream], ticks: Times) -> NDArray[np.float64]:
+        """(K, D) the newest values of all of them."""
+        values = [stream.values[stream.newest(ticks)] for stream in streams]
+        return np.concatenate([np.zeros((len(ticks), 0)), *values], 1)
 
     def _seen(self, ticks: Times, commanded: BoolArray) -> BoolArray:
-        """(K,) whether every observed topic has a sample that is new enough; counts ticks without one, and gaps.
+        """(K,) whether every topic but commands has a sample that is new enough; counts ticks without one, and gaps.
 
         commanded: (K, topics), of _commands; after the last frame nothing is, and nothing is missing.
         """
-        fresh = [self._is_fresh(stream, ticks) for stream in (*self._images, *self._state)]
+        observed = (*self._images, *self._state, *self._probes)
+        fresh = [self._is_fresh(stream, ticks) for stream in observed]
         self.tally.ticks += len(ticks)
-        streams = (*self._images, *self._state, *self._actions)
+        streams = (*observed, *self._actions)
         for stream, has in zip(streams, (*fresh, *commanded[:-1].T), strict=True):
             place = stream.place
             self.tally.missing[place] += int((~has).sum())

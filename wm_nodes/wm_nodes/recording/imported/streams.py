@@ -21,6 +21,8 @@ from wm_nodes.recording.messages import NS_PER_S, stamp_ns
 from wm_nodes.recording.typestore import is_known, typestore
 
 Times = NDArray[np.int64]
+SAMPLED = ("images", "state", "actions", "probes")
+"""Places in the contract that have a sample at every step."""
 FEWEST_PICTURES = 0.8
 """Pictures per step, below which a camera is too slow for rate_hz."""
 SET_BACK_NS = NS_PER_S
@@ -130,7 +132,7 @@ class Stream:
         elif self.set_back_ns > SET_BACK_NS:
             texts.append(f"{name} has stamps that fall by {self.set_back_ns / NS_PER_S:.1f} s; set its timeline to "
                          "receive, or record each run in a bag of its own")
-        is_stream = self.place.startswith(("images", "state", "actions"))
+        is_stream = self.place.startswith(SAMPLED)
         if is_stream and self.rate_hz < NS_PER_S / max_age_ns:
             texts.append(f"{name} comes with {self.rate_hz:.3g} Hz, and max_age_ms {max_age_ns / 1e6:g} asks for "
                          f"{NS_PER_S / max_age_ns:.3g}; raise its max_age_ms, or publish it faster")

@@ -32,7 +32,8 @@ def spec_of_contract(contract: Contract, max_steps: int) -> EnvironmentSpec:
         source=SOURCE_REAL, num_envs=1, height=height, width=width * len(cameras), cameras=tuple(cameras),
         action_names=tuple(contract.action_names), action_units=tuple(_units(actions)),
         action_scale=tuple((high - low) / 2 for source in actions for low, high in zip(source.low, source.high)),
-        state_names=tuple(contract.state_names), state_units=tuple(_units(state)), ground_truth_names=(),
+        state_names=tuple(contract.state_names), state_units=tuple(_units(state)),
+        ground_truth_names=tuple(contract.probe_names),
         control_period_s=1 / contract.rate_hz, max_episode_steps=max_steps,
     )
 
@@ -115,7 +116,7 @@ def _episode(planned: PlannedEpisode, images: UInt8Array, contract: Contract, nu
     terminated = bool(planned.success[-1])
     return Episode(
         images=images, states=planned.states, actions=planned.actions,
-        ground_truth=np.zeros((len(planned.ticks), 0), np.float32), success=planned.success, rewards=planned.rewards,
+        ground_truth=planned.probes, success=planned.success, rewards=planned.rewards,
         terminated=terminated, truncated=not terminated, task=contract.task, instruction=planned.instruction,
         behaviour=contract.episodes.behaviour, seed=number, episode_id=number, source=SOURCE_REAL,
         extra={"bag": path.name, "first_tick_ns": int(planned.ticks[0])},

@@ -99,12 +99,14 @@ def demonstrators() -> tuple[str, ...]:
 
 
 def golden_rows(episodes: EpisodeArrays) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
-    """(R, 3): episode, task, steps to learn from, for every noiseless episode that succeeds at a task."""
+    """(R, 3): episode, task, steps to learn from, for every noiseless episode that succeeds at a task; for a task
+    without a file whoever succeeds has demonstrated."""
     rows, labelled = [], episodes.labelled
     for episode, behaviour in enumerate(episodes.behaviours):
         for task, name in enumerate(episodes.tasks):
             wins = np.flatnonzero(episodes.success[episode, :, task] & labelled[episode, task])
-            if len(wins) and wins[0] > 0 and behaviour == get_task(name).model.demonstrator:
+            is_demonstrated = name not in task_names() or behaviour == get_task(name).model.demonstrator
+            if len(wins) and wins[0] > 0 and is_demonstrated:
                 rows.append((episode, task, min(int(wins[0]) + STEPS_AFTER_SUCCESS, int(episodes.lengths[episode]))))
     return np.array(rows, np.int64).reshape(-1, 3)
 

@@ -206,6 +206,8 @@ def report_when_made(
         note = f"the model's manifest holds no metrics of held-out episodes of {task}"
         return AcceptanceReport(task, 0, tuple(of_policy), {}, (note, *left_out))
     criteria, notes = apply_criteria(metrics, config, steps, imagined, real)
+    if config.reward.dense_weight > 0 and "goal_episodes" in metrics:
+        criteria = (*criteria, *_goals({name: number_of(value) for name, value in metrics.items()}, config, task))
     if manifest.get("success_threshold") != config.reward.success_threshold:
         criteria = tuple(row for row in criteria if not row.name.startswith("done"))
         at = f"reward.success_threshold {config.reward.success_threshold:g}"
@@ -290,9 +292,10 @@ def _goals(found: Mapping[str, float], config: RunConfig, part: str) -> list[Cri
     outcome: Outcome = "passed" if share >= limits.done_recall else "failed"
     ends = _interval(found["goal_found_low"], found["goal_found_high"])
     criteria = [Criterion(f"{of}: found", share, limits.done_recall, ">=", outcome, BETTER_GOALS, ends)]
-    for name in sorted(judged_things(part)):
-        copied = found[f"goal_{name}_copy_cm"]
-        ratio = found[f"goal_{name}_cm"] / copied if copied > 0 else math.nan
+    places = [name for name in sorted(judged_things(part)) if f"goal_{name}_cm" in found]
+    for name, unit in ((name, "_cm") for name in places) if places else (("perceptual", ""),):
+        copied = found[f"goal_{name}_copy{unit}"]
+        ratio = found[f"goal_{name}{unit}"] / copied if copied > 0 else math.nan
         ends = _interval(found[f"goal_{name}_ratio_low"], found[f"goal_{name}_ratio_high"])
         criteria.append(_below(f"{of}: {name} error / first frame", ratio, limits.goal_error_ratio, ends, BETTER_GOALS))
     return criteria

@@ -4,13 +4,12 @@ import numpy as np
 import torch
 
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.config.tasks import get_task
 from wm_nodes.core.statistics import bootstrap_ratio, wilson_of_share
 from wm_nodes.core.types import FloatArray
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.positions import columns_of
-from wm_nodes.world_model.text import TextModel, imagine_goals, instruction_for
+from wm_nodes.world_model.text import TextModel, imagine_goals, instruction_for, task_instruction
 from wm_nodes.world_model.training.tokenizer import episode_targets
 from wm_nodes.world_model.validation.open_loop import position_reader
 
@@ -24,16 +23,16 @@ def goal_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig
     goal_found: share of imagined episodes whose done signal exceeds reward.goal_threshold. goal_object_cm,
     goal_tool_cm, goal_perceptual: distance of the goal, imagined from the first frame and the instruction, from the
     frame of the first success; `_copy`: of the first frame from it; `_ratio_low`, `_ratio_high`: bootstrap interval of
-    the first over the second. Positions are read by the probe.
+    the first over the second. Positions are read by the probe; without positions there is no object and tool.
     """
     column = models.task_index(task)
     won = episodes.success[..., column] & episodes.labelled[:, column, None] & episodes.frame_mask
     rows = np.flatnonzero(won.any(1) & ~won[:, 0])
     if models.text is None or not len(rows):
         return {}
+    otherwise = task_instruction(task, models.spec)
     told = [
-        instruction_for(task, episodes.recorded_tasks[row], episodes.instructions[row], get_task(task).instruction)
-        for row in rows
+        instruction_for(task, episodes.recorded_tasks[row], episodes.instructions[row], otherwise) for row in rows
     ]
     known = np.array([_knows(models.text, text) for text in told])
     rows, instructions = rows[known], [text for text, knows in zip(told, known) if knows]
@@ -49,15 +48,18 @@ def goal_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig
         metrics[f"goal_found{end}"] = value
     errors = dict[tuple[str, str], FloatArray]()
     read, truth = position_reader(models.tokenizer, models.probe), episode_targets(episodes)[rows, reached]
-    places = {name: columns for name in ("object", "tool") if (columns := columns_of(task, name))}
+    has_positions = truth.shape[-1] > 0 and models.tokenizer.num_positions > 0
+    places = {name: columns for name in ("object", "tool") if has_positions and (columns := columns_of(task, name))}
     real = models.tokenizer.encode(episodes.images[rows, reached])
     for ending, frames in (("", imagined.goals), ("_copy", episodes.images[rows, 0])):
-        found = read(frames[:, None])[:, 0]
+        found = read(frames[:, None])[:, 0] if places else truth
         for name, columns in places.items():
             errors[name, ending] = 100 * np.linalg.norm(found[:, columns] - truth[:, columns], axis=-1)
             metrics[f"goal_{name}{ending}_cm"] = float(errors[name, ending].mean())
-        metrics[f"goal_perceptual{ending}"] = float((models.tokenizer.encode(frames) - real).abs().mean())
-    for name in places:
+        distance = (models.tokenizer.encode(frames) - real).abs().flatten(1).mean(1).cpu().numpy()
+        errors["perceptual", ending] = distance
+        metrics[f"goal_perceptual{ending}"] = float(distance.mean())
+    for name in (*places, "perceptual"):
         low, high = bootstrap_ratio(errors[name, ""], errors[name, "_copy"], seed=0)
         metrics |= {f"goal_{name}_ratio_low": low, f"goal_{name}_ratio_high": high}
     return metrics
