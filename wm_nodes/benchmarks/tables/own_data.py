@@ -7,6 +7,8 @@ FILE = "own_data.jsonl"
 
 def without_positions() -> Rows:
     for run in lines(FILE):
+        if "control" in run:
+            continue
         if pair := run.get("paired"):
             gain = interval(100 * pair["difference"], 100 * pair["low"], 100 * pair["high"], 1)
         else:
@@ -16,3 +18,15 @@ def without_positions() -> Rows:
         )]
         failed = "; ".join(name.split(":")[0] for name in run["acceptance"]["failed"])
         yield run["run"], *rates, gain, f"{run['acceptance']['outcome']}: {failed}"
+
+
+def fetch_reach() -> Rows:
+    """Runs of one model, beside PPO in the environment itself where that was made."""
+    for run in lines(FILE):
+        if "control" in run:
+            rates = [share(run[when]["successes"], run[when]["episodes"]) for when in (
+                "imagined_before", "imagined_after", "real_before", "real_after"
+            )]
+            before, control = run["success_before"], run["success_control"]
+            beside = (share(sum(control), len(control)), points(before, control)) if control else ("-", "-")
+            yield run["run"], *rates, points(before, run["success_after"]), *beside
