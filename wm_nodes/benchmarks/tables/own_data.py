@@ -21,7 +21,7 @@ def without_positions() -> Rows:
 
 
 def fetch_reach() -> Rows:
-    """Runs of one model, beside PPO in the environment itself where that was made, and all seeds of a length together."""
+    """Runs of one model, beside PPO in the environment itself where that was made; then all seeds together."""
     made = [run for run in lines(FILE) if "control" in run]
     for run in made:
         yield _beside_control(run["run"], [run])
