@@ -15,7 +15,7 @@ import sys
 from contextlib import contextmanager
 from pathlib import Path
 
-from setup import interpreter
+from setup import interpreter, place
 from setup.console import SetupError, isolated_environment, say
 from setup.stamp import fingerprint, finish, python_version, read_stamp, stamp_file, write_stamp
 
@@ -54,6 +54,7 @@ def ensure(argv=None):
         os.execv(other, [other, *sys.argv])
     venv = venv_folder()
     with _one_line():
+        place.refuse_links(ROOT, (venv, WORKSPACE, *(WORKSPACE / name for name in ("build", "install"))))
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # a Ctrl-C of meanwhile counts from here on
         if pending(venv):
             with _alone(venv):
@@ -127,7 +128,7 @@ def _wanted(venv):
 
 
 def _set_up(venv):
-    from setup import messages, packages, place, system
+    from setup import messages, packages, system
 
     steps = pending(venv)
     if not steps:
@@ -166,8 +167,6 @@ def _set_up(venv):
 
 
 def _note_build(wanted, venv):
-    from setup import place
-
     sources = {"messages": wanted["messages"], **place.present(venv, ROOT)}
     write_stamp(WORKSPACE / "install" / "wm_msgs" / SOURCES, sources)
 

@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-from setup.console import isolated_environment, run
+from setup.console import SetupError, isolated_environment, run
 from setup.messages import TF, link_messages, replace_file, written_in
 from setup.stamp import BEGUN, read_stamp, stamp_file
 
@@ -41,6 +41,18 @@ def former(venv: Path, root: Path) -> dict[str, str]:
 def present(venv: Path, root: Path) -> dict[str, str]:
     """The same of now."""
     return {ROOT: str(root), VENV: str(venv)}
+
+
+def refuse_links(root: Path, folders: Iterable[Path]) -> None:
+    """Raise SetupError where a folder is a link into another checkout than `root`: what is written there is no longer
+    the other's."""
+    for folder in folders:
+        homes = [parent for parent in folder.resolve().parents if (parent / "launch_scripts" / "setup").is_dir()]
+        if folder.is_symlink() and homes and homes[0] != root.resolve():
+            raise SetupError(
+                f"{folder} is a link into another checkout, whose environment the set-up would make that of this one; "
+                f"remove the link, or work in {homes[0]}"
+            )
 
 
 def settle(venv: Path, root: Path, log: Path, before: Mapping[str, str] | None = None) -> None:

@@ -245,8 +245,8 @@ def test_recorded_verdicts_are_given_again_bit_for_bit_without_asking_the_judge(
     assert len(server.requests) > asked
     assert main(["rescore", str(run), "--reward", "reference"]) == 0
     assert "by other rewards than recorded, so it is not compared" in said(capsys)
-    silent = replace(clips, audit_ids=("", *clips.audit_ids[1:]), valid=clips.valid.clone(), total=clips.total.clone())
-    silent.valid[0], silent.total[0] = False, math.nan
+    silent = replace(clips, audit_ids=("", *clips.audit_ids[1:]), total=clips.total.clone())
+    silent.total[0] = math.nan
     other = replace(clips, audit_ids=("0" * 64, *clips.audit_ids[1:]))
     monkeypatch.setattr("wm_nodes.video_rl.recorded_buffers.read_clips", lambda bag, pictures: [silent])
     assert main(["rescore", str(run), *agent]) == 0

@@ -3,6 +3,8 @@
 import http.client
 import json
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -15,9 +17,11 @@ from graph.test_runner import tiny
 from graph.test_training import train, weights_in
 
 from wm_msgs.action import Train
+from wm_msgs.msg import LearnerMetrics
 from wm_nodes.config.load import load_config
 from wm_nodes.launching.graph import NodeSpec
 from wm_nodes.launching.runner import Runner
+from wm_nodes.nodes.viewer.feed import PER_STEP, TABLE_S, TYPES, VIEW
 from wm_nodes.reports.live_page import LivePage
 
 pytestmark = [pytest.mark.graph, pytest.mark.kills, pytest.mark.slow]
@@ -59,6 +63,10 @@ def start_viewed(graph: Graph) -> str:
     graph.start_policy(await_nodes=["environment", "reward_evaluator", "learner"])
     graph.start_reward()
     graph.start_learner()
+    return page_of(graph)
+
+
+def page_of(graph: Graph) -> str:
     log = graph.log_path("/wm/viewer")
     text = wait_until("the URL", lambda: "live page http" in log.read_text() and log.read_text())
     return str(text.partition("live page ")[2].split()[0])
@@ -94,6 +102,45 @@ def test_a_training_is_shown_and_ends_with_the_same_weights_where_the_viewer_is_
     assert weights[0] == weights[1] and len(weights[0]) == 5
 
 
+def subscriptions_of_the_viewer(probe: Probe) -> set[str]:
+    return {
+        name for name in (*TYPES, *(f"sim/{name}" for name in TYPES if not name.startswith("/")))
+        for end in probe.node.get_subscriptions_info_by_topic(probe.node.resolve_topic_name(name))
+        if end.node_name == "viewer"
+    }
+
+
+def test_the_viewer_takes_steps_and_pictures_only_while_somebody_looks_and_curves_always(
+    domain: int, tmp_path: Path
+) -> None:
+    costly = {name for name in (*PER_STEP, "sim/env/transition", f"sim/{VIEW}") if name != "env/image"}
+    always = {*TYPES, "sim/env/spec", "sim/episode", "sim/run/state"} - {*PER_STEP}
+    graph, probe = Graph(domain, tmp_path), Probe(domain)
+    try:
+        graph.start("viewer", run_dir="''")
+        url = page_of(graph)
+        metrics = probe.publisher("learner/metrics")
+        wait_until("the viewer's ears", lambda: subscriptions_of_the_viewer(probe) >= always)
+        wait_until("their match", metrics.get_subscription_count)
+        for update in (1, 2, 3):
+            metrics.publish(LearnerMetrics(update=update, success_rate=0.25 * update))
+        time.sleep(3 * TABLE_S)
+        assert subscriptions_of_the_viewer(probe) == always, "nobody looks"
+        for _ in range(2):
+
+            def until(panels: dict[str, Any]) -> bool:
+                return "charts" in panels and subscriptions_of_the_viewer(probe) == always | costly
+
+            charts = read_panels(url, until)["charts"]["charts"]
+            assert [point[0] for point in charts[0]["lines"][0]["points"]] == [1, 2, 3], "from before"
+            wait_until("the end of looking", lambda: subscriptions_of_the_viewer(probe) == always)
+        assert graph.processes["/wm/viewer"].poll() is None
+    finally:
+        probe.close()
+        codes = graph.stop()
+    assert codes == {"/wm/viewer": 0}
+
+
 def test_a_viewer_that_cannot_open_its_page_does_not_end_the_graph(ros_domain: int, tmp_path: Path) -> None:
     with LivePage() as other:
         viewers = [
@@ -109,3 +156,16 @@ def test_a_viewer_that_cannot_open_its_page_does_not_end_the_graph(ros_domain: i
             wait_until("the page", lambda: log.is_file() and "live page http" in log.read_text())
             assert runner.wait(0.5) == 0 and runner.failure() is None
         assert runner.wait_ended("viewer") == 0, "SIGINT ends it in order"
+
+
+def test_the_benchmark_counts_the_cpu_time_of_the_nodes_with_and_without_the_page(tmp_path: Path) -> None:
+    program = "import sys; from wm_nodes.apps.cli import main; sys.exit(main(sys.argv[1:]))"
+    file = tmp_path / "view.json"
+    words = ["benchmark", "view", "--steps", "20", "--triples", "1", "--json", str(file)]
+    done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, encoding="utf-8", check=False)
+    assert done.returncode == 0 and "page in a browser" in done.stdout, done.stdout + done.stderr
+    results = json.loads(file.read_text())
+    assert results["nodes_cpu_ratio"]["no page"] == [1.0] and results["viewer_cpu_ratio"]["no page"] == [0.0]
+    assert results["viewer_cpu_ratio"]["page in a browser"][0] > 0
+    nodes = {"environment", "reward_evaluator", "policy", "recorder"}
+    assert [set(spent) for spent in results["cpu_s"][0].values()] == [nodes] * 3

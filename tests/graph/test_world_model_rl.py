@@ -34,7 +34,7 @@ from wm_nodes.training.run_lock import NAME
 from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import load_video_folder
-from wm_nodes.video_rl.execution_reward import EXECUTION_SCORES, load_execution_reward
+from wm_nodes.video_rl.execution_reward import EXECUTION_SCORES
 from wm_nodes.video_rl.recorded_buffers import RecordedClips, read_clips, rescore
 from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, ClipScores, load_probe
 from wm_nodes.video_rl.sampling import RecordedContexts
@@ -179,10 +179,7 @@ def test_recorded_clips_are_scored_again_to_the_same_bits(
     first, folder = recorded(run_dir)[0], load_video_folder(run_dir / "video_model")
     for name in ("closeness", "execution"):
         assert first.weights[name] == 0.5 and first.scores[name].isfinite().all() and first.scores[name].std() > 0
-    again = partial(
-        rescore, contexts=contexts, probe=probe, codec=folder.codec, rewards=config.rewards, num_conditioning=1,
-        execution=load_execution_reward(config, folder, contexts, probe),
-    )
+    again = partial(rescore, source=RecordedContexts(folder, contexts, config, probe))
     values = first.scores["tool_cm"].clone()
     values[3] = torch.nextafter(values[3], torch.tensor(torch.inf, dtype=torch.float64))
     changed = replace(first, scores={**first.scores, "tool_cm": values})
@@ -349,7 +346,7 @@ def test_the_launch_file_trains_a_given_model_on_given_recordings_and_records_it
     finally:
         operator.close()
     (clips,) = read_clips(tmp_path / "run" / "bags" / "world_model_rl")
-    assert clips.iteration == 0 and bool(clips.valid.all())
+    assert clips.iteration == 0 and bool(clips.total.isfinite().all())
 
 
 def test_settings_that_the_graphs_model_or_the_ratio_cannot_have_are_refused_before_anything_is_made(

@@ -24,6 +24,7 @@ from wm_nodes.reports.summary import plain
 
 EXPERIMENTS = {
     "speed": "speed.speed:Speed", "device-speed": "speed.device:DeviceSpeed",
+    "view": "speed.view:View",
     "trained-in": "environments.experiments:TrainedIn", "ranking": "environments.experiments:Ranking",
     "disc-base": "video_rl.discs:DiscBase", "diversity": "video_rl.diversity:DiscDiversity",
     "learning": "video_rl.discs:Learning", "ablations": "video_rl.discs:Ablations",

@@ -19,7 +19,7 @@ from wm_nodes.recording import read_episodes
 from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model import load_model_folder, load_starts
 from wm_nodes.world_model.starts import load_start_seeds
-from wm_nodes.world_model.validation.open_loop import episode_errors, evaluate_rollouts
+from wm_nodes.world_model.validation.open_loop import episode_errors, evaluate_rollouts, imagine_episodes
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,8 @@ def test_errors_of_an_episode_are_those_at_its_own_last_step(
     models, episodes = load_model_folder(model_dir), load_arrays(bags[1], config)
     cut = replace(episodes, lengths=np.full(len(episodes), 4))
     found = episode_errors(models.tokenizer, models.action, cut, config.task, threshold=0.7, probe=models.probe)
-    means = evaluate_rollouts(models.tokenizer, models.action, episodes, probe=models.probe)
+    imagined = imagine_episodes(models.tokenizer, models.action, episodes)
+    means = evaluate_rollouts(models.tokenizer, imagined, episodes, probe=models.probe)
     assert found["tool_cm"].mean() == pytest.approx(means["tool_rollout_cm_h04"], rel=1e-4)
     assert found["object_cm"].mean() == pytest.approx(means["object_rollout_cm_h04"], rel=1e-4)
     whole = episode_errors(models.tokenizer, models.action, episodes, config.task, threshold=0.7, probe=models.probe)

@@ -15,7 +15,7 @@ import run_tests
 import torch
 
 import setup
-from setup import entry, interpreter, messages, packages, stamp
+from setup import entry, interpreter, messages, packages, place, stamp
 from setup.console import SetupError, isolated_environment, run
 
 
@@ -368,3 +368,34 @@ def test_ctrl_c_from_the_first_line_of_a_start_on_is_one_line(
             assert capsys.readouterr().err == "interrupted\n"
     finally:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+
+
+@pytest.mark.parametrize("name", [".venv", "ros2_ws/install"])
+def test_a_link_into_another_checkout_is_refused_in_one_line_and_nothing_is_changed_there(
+    name: str, repository: Path, tmp_path: Path
+) -> None:
+    ours, other = tmp_path / "ours", tmp_path / "other"
+    for root in (ours, other):
+        shutil.copytree(repository / "launch_scripts", root / "launch_scripts")
+    (other / name).mkdir(parents=True)
+    (ours / name).parent.mkdir(exist_ok=True)
+    (ours / name).symlink_to(other / name)
+    environment = {key: value for key, value in os.environ.items() if key != "WM_VENV"}
+    for script in ("wm.py", "online_rl.py", "setup", "evaluate.launch.py"):
+        command = [sys.executable, str(ours / "launch_scripts" / script)]
+        if script == "wm.py":
+            command += ["view", "bag"]
+        done = subprocess.run(command, env=environment, capture_output=True, encoding="utf-8", check=False)
+        assert done.returncode == 1 and done.stderr == (
+            f"error: {ours / name} is a link into another checkout, whose environment the set-up would make that of "
+            f"this one; remove the link, or work in {other}\n"
+        )
+    assert [*(other / name).iterdir()] == [] and not (other / ".venv_setup.log").exists()
+
+
+def test_an_environment_that_a_link_puts_on_another_disk_is_no_other_checkout(tmp_path: Path) -> None:
+    (tmp_path / "disk" / "venv").mkdir(parents=True)
+    (tmp_path / "checkout" / "launch_scripts" / "setup").mkdir(parents=True)
+    link = tmp_path / "checkout" / ".venv"
+    link.symlink_to(tmp_path / "disk" / "venv")
+    place.refuse_links(tmp_path / "checkout", (link, tmp_path / "absent"))

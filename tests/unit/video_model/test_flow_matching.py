@@ -15,7 +15,7 @@ from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.flow_matching import flow_matching_loss, train_video_model
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_rl.sampling import ClipGenerator, GroupRequest, sample_by_ode
+from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts, sample_by_ode
 
 SHAPE = (2, 3, 4, 4)
 SETTINGS = load_video_config("base").model.training
@@ -117,7 +117,7 @@ def test_one_model_samples_and_shows_clips_of_whatever_size_its_contexts_have(he
     codec = PatchCodec(4, 6)
     codec.fit(contexts(20, 8, 12).frames.flatten(0, 1))
     folder = VideoFolder(codec, tiny_network(6), {"stride": 1, "num_conditioning": 1}, {})
-    generator = ClipGenerator(folder, contexts(2, height, width), load_video_config("smoke"))
+    generator = RecordedContexts(folder, contexts(2, height, width), load_video_config("smoke"))
     buffer = generator.sample(GroupRequest((0, 1), 2, 0, 0))
     assert buffer.rollout.latents.shape == (4, 6, 3, height // 4, width // 4)
     shown = sample_by_ode(folder, generator.contexts, generator.config, 2)

@@ -23,6 +23,7 @@ from video_toys import (
     toy_rollout_settings,
 )
 
+from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import RolloutConfig
 from wm_nodes.video_model import (
     StepContext,
@@ -34,7 +35,7 @@ from wm_nodes.video_model import (
     step,
 )
 from wm_nodes.video_model.kernels import SIGMA_LIMIT, with_conditioning
-from wm_nodes.video_rl.grpo_math import gaussian_logprob
+from wm_nodes.video_rl.ratio_and_kl import gaussian_logprob
 
 BIG = (1, 4, 8, 16, 16)
 """D = 8192."""
@@ -67,11 +68,12 @@ def test_times_fall_from_exactly_one_to_exactly_zero_for_every_number_of_steps(s
 
 
 @pytest.mark.parametrize(
-    ("num_steps", "shift", "named"), [(0, 1.0, "num_steps.*0"), (4, 0.0, "shift.*0"), (4, -1, "-1")]
+    ("setting", "value"),
+    [("rollout.num_steps", 0), ("rollout.shift", 0.0), ("grpo.advantage.best_of_n", -1), ("evaluation.window", 2)],
 )
-def test_no_step_and_a_shift_that_is_not_positive_are_refused(num_steps: int, shift: float, named: str) -> None:
-    with pytest.raises(ValueError, match=named):
-        flow_times(num_steps, shift)
+def test_numbers_that_no_formula_takes_are_refused_where_they_are_set(setting: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{setting}.*{value}"):
+        load_video_config("base", {setting: value})
 
 
 # algebra of one step

@@ -18,7 +18,7 @@ from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.conditions import hashed_words
 from wm_nodes.video_model.continuation import ClipLengths, continue_videos
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_model.video_environment import ROWS, VideoEnvironment, check_steppable
+from wm_nodes.video_model.video_environment import ROWS, VideoEnvironment, VideoEpisodes, check_steppable
 
 NUM_ENVS, NUM_STARTS, HEIGHT, WIDTH = 3, 5, 16, 32
 CLIP = {"stride": 1, "num_conditioning": 1, "given_frames": 4, "new_frames": 2}
@@ -64,10 +64,11 @@ def make(
     reader: Reader | None = None, exact: bool = False,
 ) -> VideoEnvironment:
     config = load_config("base")
-    return VideoEnvironment(
+    episodes = VideoEpisodes(
         folder or make_folder(), reader or Reader(), spec_of(), starts(), config.reward, config.video_environment,
-        num_envs=num_envs, seed=seed, exact=exact,
+        num_envs=num_envs, exact=exact,
     )
+    return VideoEnvironment(episodes, seed=seed)
 
 
 def actions(step: int, count: int = NUM_ENVS) -> FloatArray:

@@ -35,7 +35,7 @@ def drawn(positions: FloatArray) -> Tensor:
 
 
 def faults(positions: FloatArray, frames: Tensor | None = None) -> dict[str, float]:
-    found = find_faults(drawn(positions) if frames is None else frames, positions, LIMITS, SCENE, 1).named()
+    found = find_faults(drawn(positions) if frames is None else frames, positions, LIMITS, SCENE, 1)
     assert all(value.dtype == torch.float64 and value.shape == (1,) for value in found.values())
     return {name: float(value) for name, value in found.items()}
 

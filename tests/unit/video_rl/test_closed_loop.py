@@ -17,15 +17,13 @@ from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.horizons import Headroom, horizon_scores, measure_headroom
 from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, score_pictures
+from wm_nodes.video_rl.reward_hacking import WATCHED
 from wm_nodes.video_rl.sampling import (
-    ClipGenerator,
     GroupRequest,
     RecordedContexts,
-    drawn_history,
-    recorded_place,
 )
 from wm_nodes.video_rl.train import post_train, sample_buffers
-from wm_nodes.video_rl.validation import WATCHED, context_scores
+from wm_nodes.video_rl.validation import context_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
 GIVEN, NEW, FRAMES = 3, 2, 9
@@ -98,17 +96,17 @@ def test_a_clip_begins_with_as_many_frames_as_there_are(history: int, first: int
 
 
 def test_how_many_clips_come_before_is_drawn_for_each_iteration_from_the_seed_alone() -> None:
-    drawn = [drawn_history(CONFIG, iteration) for iteration in range(40)]
-    assert set(drawn) == {0, 1, 2, 3} and drawn == [drawn_history(CONFIG, iteration) for iteration in range(40)]
     source = make_source()
+    drawn = [source.request(iteration, 0).history for iteration in range(40)]
+    assert set(drawn) == {0, 1, 2, 3} and drawn == [make_source().request(i, 1).history for i in range(40)]
     for iteration, history in enumerate(drawn[:12]):
         request = source.request(iteration, 0)
-        assert request.history == history
-        first, given = recorded_place(CONFIG, iteration)
+        assert history is not None
+        first, given = source.place(request)
         assert (first, given) == ((2 * history + 1 - GIVEN, GIVEN) if history else (0, 1))
         assert source.references(request).frames[0, 0, 0, 0, 0] == first + 10 * request.contexts[0]
-    plain = CONFIG.with_values(groups=CONFIG.groups.with_values(history=0))
-    assert drawn_history(plain, 0) is None and recorded_place(plain, 0) == (0, 1)
+    plain = make_source(CONFIG.with_values(groups=CONFIG.groups.with_values(history=0))).request(0, 0)
+    assert plain.history is None and source.place(plain) == (0, 1)
 
 
 def test_a_continuation_is_scored_on_its_new_frames_alone() -> None:
@@ -137,16 +135,14 @@ def test_a_group_is_trained_and_evaluated_by_closeness_where_no_recording_has_si
     heldout = context_scores(folder, blind, probe, config)
     assert heldout["closeness"].isfinite().all() and set(PICTURE_SCORES) <= set(WATCHED)
     for one in measure_headroom(folder, blind, config, probe):
-        assert one.codec > one.reward and one.gain[0] > 0 and np.isnan(one.object_cm).all()
+        assert one.codec > one.reward and one.gain[0] > 0
 
 
 def test_settings_that_a_model_or_its_recordings_cannot_have_are_refused() -> None:
     with pytest.raises(ValueError, match="whole episodes"):
         make_source(folder=make_folder(given=0))
-    with pytest.raises(ValueError, match="goes on from 2 frames with 2 new ones, the settings say 3 and 2"):
-        make_source(folder=make_folder(given=2))
     with pytest.raises(ValueError, match="3 clips and one more have 9 frames, the recordings 8"):
-        ClipGenerator(make_folder(), recorded(8), CONFIG)
+        RecordedContexts(make_folder(), recorded(8), CONFIG)
     with pytest.raises(ValueError, match="a judge sees whole episodes"):
         load_video_config("closed_loop", {"rewards.agent": 1.0})
 
@@ -159,7 +155,7 @@ def test_a_group_of_equal_clips_has_no_head_room_and_one_of_different_clips_what
     found = measure_headroom(folder, recorded(), silent, probe)
     assert [one.clips for one in found] == [1, 2, 3, 4]
     for one in found:
-        assert one.gain == pytest.approx((0, 0, 0), abs=1e-9) and one.spread == pytest.approx(0, abs=1e-9)
+        assert one.gain == pytest.approx((0, 0, 0), abs=1e-9)
         assert one.share == pytest.approx(0, abs=1e-6) and one.codec > one.reward
     source = make_source()
     for one in measure_headroom(folder, recorded(), CONFIG, probe):
@@ -172,7 +168,7 @@ def test_a_group_of_equal_clips_has_no_head_room_and_one_of_different_clips_what
 
 
 def test_a_gain_is_weighed_against_what_is_missing_to_the_codec() -> None:
-    one = Headroom(2, 0.5, 0.52, (0.02, 0.01, 0.03), 0.01, 0.7, (0, 0, 0), (0, 0, 0))
+    one = Headroom(2, 0.5, 0.52, (0.02, 0.01, 0.03), 0.7)
     assert one.share == pytest.approx(0.15) and replace(one, codec=0.5).share == 0
 
 

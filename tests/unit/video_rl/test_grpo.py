@@ -34,8 +34,7 @@ from wm_nodes.training.weights import WeightsError
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError, StepContext, VideoNetwork, step
 from wm_nodes.video_rl.group_advantages import GroupAdvantages
 from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner
-from wm_nodes.video_rl.grpo_math import gaussian_logprob
-from wm_nodes.video_rl.ratio_and_kl import Rows
+from wm_nodes.video_rl.ratio_and_kl import Rows, gaussian_logprob
 
 NO_KL = kl_config(beta=0.0)
 MODES = ["mean", "logk2"]
@@ -216,7 +215,7 @@ def test_a_rank_without_a_transition_has_a_gradient_of_zero_and_counts_nothing()
     learner = make(ranks=OneOfTwo(1, 2))
     buffer = buffer_of(learner)
     sums = learner.gradients(buffer, Rows(torch.tensor([0]), torch.tensor([1])), SIGNAL)
-    assert all(math.isfinite(value) for value in sums.values()) and sums["objective"] == sums["low"] == 0.0
+    assert all(math.isfinite(value) for value in sums.values()) and sums["objective"] == sums["clip_low_share"] == 0.0
     given = [None if p.grad is None else bool(p.grad.any()) for p in learner.parameters]
     full = make()
     gradient(full, buffer)

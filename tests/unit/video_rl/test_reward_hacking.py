@@ -12,9 +12,8 @@ def test_the_slope_of_a_line_is_exact_and_has_no_error() -> None:
 
 def test_a_reward_that_rises_while_the_truth_falls_is_named_and_one_that_rises_with_it_is_not() -> None:
     reward, falling, rising = [0.1, 0.2, 0.3, 0.4], [0.9, 0.8, 0.7, 0.6], [0.2, 0.3, 0.4, 0.5]
-    (found,) = find_hacked_metrics(reward, {"mass": falling, "obeyed": rising}, window=4)
-    assert found.metric == "mass"
-    assert found.proxy_slope == pytest.approx(0.1) and found.true_slope == pytest.approx(-0.1)
+    found = find_hacked_metrics(reward, {"mass": falling, "obeyed": rising}, window=4)
+    assert found == {"mass": pytest.approx(-0.1)}
 
 
 def test_only_the_last_evaluations_count() -> None:
@@ -29,10 +28,3 @@ def test_two_flat_noisy_curves_hardly_ever_raise_an_alarm(window: int) -> None:
     draw = lambda: generator.normal(size=window).tolist()  # noqa: E731
     alarms = sum(bool(find_hacked_metrics(draw(), {"mass": draw()}, window=window)) for _ in range(cases))
     assert alarms <= 0.002 * cases
-
-
-def test_a_window_of_two_and_curves_of_different_lengths_are_refused() -> None:
-    with pytest.raises(ValueError, match="got 2"):
-        find_hacked_metrics([1.0, 2.0], {}, window=2)
-    with pytest.raises(ValueError, match="mass has 3"):
-        find_hacked_metrics([1.0, 2.0, 3.0, 4.0], {"mass": [1.0, 2.0, 3.0]}, window=3)

@@ -16,8 +16,8 @@ from wm_nodes.training.metrics import read_metrics
 from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model import VideoNetwork
 from wm_nodes.video_rl.reference_reward import more_is_better
+from wm_nodes.video_rl.reward_hacking import WATCHED, alarm_text, hacked_slopes, hacking_alarms
 from wm_nodes.video_rl.training_run import VIDEO_FILES, VideoRun, progress
-from wm_nodes.video_rl.validation import WATCHED, alarm_text, alarms_of, find_hacked_now
 
 ROLLOUT = toy_rollout_settings(micro_batch=8)
 SCORES = set(WATCHED)
@@ -54,34 +54,36 @@ def lines(rewards: list[float | None], **scores: list[float]) -> list[dict[str, 
 
 def test_an_error_that_grows_while_the_reward_rises_is_named_with_both_slopes() -> None:
     rising = [0.1, 0.2, 0.3]
-    (alarm,) = find_hacked_now(lines(rising, object_cm=[5.0, 6.0, 7.0], tracking=[0.1, 0.2, 0.3]), window=3)
-    assert (alarm.metric, alarm.proxy_slope, alarm.true_slope) == ("object_cm", pytest.approx(0.1), pytest.approx(-1.0))
-    assert "reward rises by 0.1 per evaluation while held-out scores get worse: object_cm by 1;" in alarm_text([alarm])
-    assert not find_hacked_now(lines(rising, object_cm=[7.0, 6.0, 5.0], tracking=[0.1, 0.2, 0.3]), window=3)
-    assert not find_hacked_now(lines(rising[::-1], object_cm=[5.0, 6.0, 7.0]), window=3)
-    assert find_hacked_now(lines(rising[:2], object_cm=[5.0, 6.0]), window=3) is None, "nothing was looked at"
-    assert find_hacked_now(lines(rising, object_cm=[7.0, 6.0, 5.0]), window=3) == []
+    alarms = hacking_alarms(lines(rising, object_cm=[5.0, 6.0, 7.0], tracking=[0.1, 0.2, 0.3]), window=3)
+    assert alarms == {"hacked": 1, "reward_slope": pytest.approx(0.1), "hacked_object_cm": pytest.approx(-1.0)}
+    assert "reward rises by 0.1 per evaluation while held-out scores get worse: object_cm by 1;" in alarm_text(alarms)
+    none = {"hacked": 0.0}
+    assert hacking_alarms(lines(rising, object_cm=[7.0, 6.0, 5.0], tracking=[0.1, 0.2, 0.3]), window=3) == none
+    assert hacking_alarms(lines(rising[::-1], object_cm=[5.0, 6.0, 7.0]), window=3) == none
+    assert hacking_alarms(lines(rising[:2], object_cm=[5.0, 6.0]), window=3) == {}, "nothing was looked at"
+    assert alarm_text(none) == alarm_text({}) == ""
 
 
 def test_the_object_that_moves_too_far_is_as_wrong_as_the_one_that_stays() -> None:
     assert more_is_better("motion", [0.5, 1.0, 1.5]).tolist() == [-0.5, 0.0, -0.5]
-    (alarm,) = find_hacked_now(lines([1, 2, 3], motion=[1.0, 1.2, 1.4]), window=3)
-    assert alarm.true_slope == pytest.approx(-0.2)
+    assert hacked_slopes(hacking_alarms(lines([1, 2, 3], motion=[1.0, 1.2, 1.4]), window=3)) == {
+        "motion": pytest.approx(-0.2)
+    }
 
 
 def test_the_reward_of_an_evaluation_is_the_mean_over_the_buffers_since_the_one_before() -> None:
     rows = [{"section": "grpo", "step": i + 1, "reward_mean": float(r)} for i, r in enumerate([1, 3, 2, 4, 5, 3])]
     rows += [{"section": "heldout", "step": step, "psnr_db": 20.0 - step} for step in (2, 4, 6)]
-    (alarm,) = find_hacked_now(rows, window=3)  # rewards 2, 3, 4
-    assert alarm.proxy_slope == pytest.approx(1.0) and alarm.true_slope == pytest.approx(-2.0)
+    alarms = hacking_alarms(rows, window=3)  # rewards 2, 3, 4
+    assert alarms["reward_slope"] == pytest.approx(1.0) and alarms["hacked_psnr_db"] == pytest.approx(-2.0)
 
 
 def test_a_missing_value_takes_its_score_out_and_a_missing_reward_its_evaluation() -> None:
     known: list[float | None] = [1.0, 2.0, 3.0]
     rows = lines(known, psnr_db=[3.0, 2.0, 1.0], tracking=[3.0, 2.0, 1.0])
     rows[3]["psnr_db"] = None
-    assert [alarm.metric for alarm in find_hacked_now(rows, window=3)] == ["tracking"]
-    assert not find_hacked_now(lines([1.0, None, 3.0], tracking=[3.0, 2.0, 1.0]), window=3)
+    assert list(hacked_slopes(hacking_alarms(rows, window=3))) == ["tracking"]
+    assert not hacking_alarms(lines([1.0, None, 3.0], tracking=[3.0, 2.0, 1.0]), window=3)
 
 
 class Falling:
@@ -105,7 +107,7 @@ def test_held_out_scores_are_written_every_so_many_buffers_and_the_alarm_with_th
 ) -> None:
     run = VideoRun(network, config(every=2), tmp_path, heldout=Falling(network))
     train(run, [1, 2, 3, 4])
-    assert run.hacked == []
+    assert run.alarms == {}
     run.close()
     heldout = Falling(network)
     heldout.seen = [{}, {}]
@@ -116,7 +118,7 @@ def test_held_out_scores_are_written_every_so_many_buffers_and_the_alarm_with_th
     assert [(line["step"], line.get("hacked")) for line in written_lines] == [(2, None), (4, None), (6, 1.0)]
     last = written_lines[-1]
     assert last["reward"] is None and last["reward_slope"] == pytest.approx(2.0)
-    assert run.hacked == alarms_of(last) and run.hacked[0].metric == "tracking"
+    assert hacked_slopes(run.alarms) == hacked_slopes(last) == {"tracking": pytest.approx(-0.1)}
     assert last["hacked_tracking"] == pytest.approx(-0.1) and "hacked_psnr_db" not in last
     assert written(last, SCORES) | SCORES <= documented("section `heldout`")
     assert written(read_metrics(tmp_path, "grpo")[0], SCORES) == documented("section `grpo`")

@@ -15,6 +15,7 @@ from wm_nodes.world_model import WorldModels
 from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
 from wm_nodes.world_model.validation.controllability import controllability_metrics, follow
+from wm_nodes.world_model.validation.open_loop import imagine_episodes
 from wm_nodes.world_model.validation.pictures import horizons_of, judged_horizon, picture_metrics
 
 CONFIG = load_config("base", {
@@ -56,18 +57,22 @@ def test_a_model_that_obeys_is_worse_on_another_episodes_actions_and_follows_the
     assert metrics["tool_command_cm_h12"] < metrics["tool_shuffled_cm_h12"] < 0.7 * standing_still
 
 
+def metrics_of_pictures(models: WorldModels, episodes: EpisodeArrays) -> dict[str, float]:
+    return picture_metrics(models, imagine_episodes(models.tokenizer, models.action, episodes), episodes)
+
+
 @pytest.mark.slow
 def test_by_pictures_alone_a_trained_model_is_nearer_than_copying_and_further_under_other_actions(
     models: WorldModels
 ) -> None:
     known = replace(models, spec=replace(SPEC, num_envs=1))
-    metrics = picture_metrics(known, arrays(24, 10_000))
+    metrics = metrics_of_pictures(known, arrays(24, 10_000))
     assert horizons_of(metrics) == [1, 2, 4, 8, 12] and judged_horizon(metrics) == 12
     assert metrics["feature_floor_h12"] < metrics["feature_ratio_h12"] < metrics["feature_ratio_high_h12"] < 0.9
     assert metrics["other_actions_h12"] > metrics["other_actions_low_h12"] > 1
     same = arrays(24, 10_000)
     alike = replace(same, actions=np.zeros_like(same.actions))
-    assert np.isnan(picture_metrics(known, alike)["other_actions_h12"])
+    assert np.isnan(metrics_of_pictures(known, alike)["other_actions_h12"])
 
 
 @pytest.mark.slow
@@ -81,7 +86,7 @@ def test_a_model_that_ignores_actions_loses_nothing_by_others(models: WorldModel
         torch.nn.init.zeros_(weight)
     metrics = controllability_metrics(replace(models, action=deaf), arrays(24, 10_000), SPEC)
     assert {value for name, value in metrics.items() if name.startswith("psnr_shuffled_drop")} == {0.0}
-    seen = picture_metrics(replace(models, action=deaf), arrays(24, 10_000))
+    seen = metrics_of_pictures(replace(models, action=deaf), arrays(24, 10_000))
     assert seen["other_actions_h12"] == seen["other_actions_low_h12"] == seen["other_actions_high_h12"] == 1.0
 
 

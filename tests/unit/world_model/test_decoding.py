@@ -17,7 +17,7 @@ from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.training.dynamics import tokenise_episodes
 from wm_nodes.world_model.training.token_dynamics import MAX_CORRUPTION, corrupt, mask_tokens, train_token_model
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
-from wm_nodes.world_model.validation.open_loop import evaluate_rollouts
+from wm_nodes.world_model.validation.open_loop import evaluate_rollouts, imagine_episodes
 
 BATCH, TOKENS, BITS = 3, 8, 4
 
@@ -159,5 +159,6 @@ def test_a_token_model_learns_a_scene_and_imagines_it_behind_the_environment_int
     )
     models = load_model_folder(folder)
     assert isinstance(models.action, TokenActionModel)
-    results = evaluate_rollouts(models.tokenizer, models.action, episodes.select(range(8)))
+    some = episodes.select(range(8))
+    results = evaluate_rollouts(models.tokenizer, imagine_episodes(models.tokenizer, models.action, some), some)
     assert results["psnr_rollout_db_h12"] > 10

@@ -38,7 +38,7 @@ from wm_nodes.world_model.training.position_probe import train_position_probe
 from wm_nodes.world_model.training.state_probe import train_state_probe
 from wm_nodes.world_model.training.text import train_text_model
 from wm_nodes.world_model.training.tokenizer import episode_targets, foreground_weight, train_tokenizer
-from wm_nodes.world_model.validation.open_loop import auc, detection_metrics, evaluate_rollouts
+from wm_nodes.world_model.validation.open_loop import auc, detection_metrics, evaluate_rollouts, imagine_episodes
 
 TASKS = ("push_cube", "reach")
 
@@ -346,6 +346,7 @@ def test_rollouts_of_a_trained_model_follow_pushed_objects_better_than_copying_t
     assert tokenizer_metrics["psnr_db"] > 22
     data = tokenise_episodes(tokenizer, training)
     model, _ = train_action_model(tokenizer, data, config, 0, None)
-    metrics = evaluate_rollouts(tokenizer, model, arrays(32, 10_000), threshold=0.5)
+    heldout = arrays(32, 10_000)
+    metrics = evaluate_rollouts(tokenizer, imagine_episodes(tokenizer, model, heldout), heldout, threshold=0.5)
     assert metrics["tool_ratio_h12"] < 0.6
     assert metrics["object_moved_ratio_h12"] < 0.7

@@ -59,7 +59,7 @@ class JudgedContexts(RecordedContexts):
         check_one_judge(self.verdicts, clips.group_ids.tolist())
         if reason := pause_reason(self.verdicts):
             raise TrainingPaused(reason)
-        scores = self.scores(request, frames, given) | agent_scores(self.verdicts)
+        scores = self.scores(request, frames) | agent_scores(self.verdicts)
         return attach_rewards(clips, scores, mix_rewards(scores, self.config.rewards))
 
 

@@ -1,4 +1,4 @@
-"""Check a video model before GRPO trains it: ratio, KL, ODE step, mask, buffer and memory, a line each; of an embedded
+"""Check a video model before GRPO trains it: ratio, KL, ODE step, mask and buffer, a line each; of an embedded
 one what the best clip of a group is better by than the others, clip after clip on its own frames: where that closes
 little of the gap to the codec, no group method can learn.
 
@@ -79,16 +79,12 @@ def _print_headroom(
     frames = sample_by_ode(folder, clips, config, config.rollout.num_steps)
     drift = {name: float(values.mean()) for name, values in horizon_scores(frames, clips, probe, folder).items()}
     columns = (
-        "clip", "reward", "best of n", "gain", "object, cm less", "tool, cm less", "std in a group", "codec",
-        "of the gap, at most",
-        *(f"rollout {name}" for name in DRIFT),
+        "clip", "reward", "best of n", "gain", "codec", "of the gap, at most", *(f"rollout {name}" for name in DRIFT)
     )
     rows = (
         (
-            str(h.clips), f"{h.reward:.3f}", f"{h.best:.3f}", estimate(h.gain, ".3f"), estimate(h.object_cm, ".2f"),
-            estimate(h.tool_cm, ".2f"), f"{h.spread:.3f}", f"{h.codec:.3f}",
-            f"{h.share:.0%}",
-            *(f"{drift[f'{name}_{h.clips}']:.2f}" for name in DRIFT),
+            str(h.clips), f"{h.reward:.3f}", f"{h.best:.3f}", estimate(h.gain, ".3f"), f"{h.codec:.3f}",
+            f"{h.share:.0%}", *(f"{drift[f'{name}_{h.clips}']:.2f}" for name in DRIFT),
         )
         for h in found
     )
@@ -125,10 +121,9 @@ def _model_to_check(
 
 
 def _public(arguments: argparse.Namespace, config: VideoRlConfig, device: str) -> ModelToCheck:
-    from wm_nodes.video_model.adapters import LoadSettings, add_lora, load_public_model
+    from wm_nodes.video_model.adapters import add_lora, load_public_model
 
-    loading = LoadSettings(dtype=arguments.dtype, device=device, offload=arguments.offload)
-    public = load_public_model(arguments.public, loading)
+    public = load_public_model(arguments.public, dtype=arguments.dtype, device=device, offload=arguments.offload)
     frames = torch.from_numpy(np.stack([_picture(arguments)] * arguments.frames))[None]
     C, F, H, W = public.codec.encode(frames).shape[1:]
     condition = public.condition(frames[:, :1], [arguments.prompt], F).repeat_interleave(VIDEOS)

@@ -47,6 +47,7 @@ GROUPS = {
         "collect": "episodes of tasks in the simulator, planned and scripted",
         "view": "a recording, or a run, on a live page of this host",
         "rescore": "score a recording again, compare bit for bit",
+        "follow-clips": "a video model's clips as episodes that a policy is cloned from",
         "retrain": "train a video model again on a run's recorded clips and scores",
         "recover-bag": "bring back a recording whose process was killed",
         "import rosbag": "plain ROS bags of your robot into one of ours, by a contract",
@@ -62,6 +63,7 @@ GROUPS = {
     "benchmarks, where the repository is": {
         "benchmark speed": "graph, world model and simulator, side by side",
         "benchmark device-speed": "what a GPU makes of both loops",
+        "benchmark view": "CPU time that the live page costs the other nodes",
         "benchmark trained-in": "policies trained in each model, measured in the simulator",
         "benchmark ranking": "imagined success of policies against their real success",
         "benchmark disc-base": "the video model that experiments on the moving disc begin with",

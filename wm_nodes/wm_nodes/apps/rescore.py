@@ -45,10 +45,9 @@ from wm_nodes.training.run_record import CONFIG
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl import recorded_buffers
-from wm_nodes.video_rl.execution_reward import load_execution_reward
-from wm_nodes.video_rl.recorded_buffers import BufferJudge, JudgedBuffer, RecordedClips, Rescored
+from wm_nodes.video_rl.recorded_buffers import BufferJudge, RecordedClips, Rescored
 from wm_nodes.video_rl.reference_reward import load_probe
-from wm_nodes.video_rl.sampling import recorded_place
+from wm_nodes.video_rl.sampling import RecordedContexts
 
 RESCORED = "rescored.json"
 SHOWN = 10
@@ -151,19 +150,15 @@ def _clips(arguments: argparse.Namespace, run_dir: Path) -> Outcome:
     chosen = {**reward_overrides(arguments.reward), **judge_settings(arguments), **device_settings(arguments)}
     run_dir, config = recorded_buffers.read_run(run_dir, chosen)
     device = compute_device(config.device)
-    probe, folder = load_probe(shipped_model(config.task), device), load_video_folder(run_dir / "video_model", device)
+    folder = load_video_folder(run_dir / "video_model", device)
     bags = recorded_buffers.recorded_episodes(run_dir, "train")
     contexts = load_clips(bags, config.model.stride, config.clip_steps)
-    execution = load_execution_reward(config, folder, contexts, probe)
+    source = RecordedContexts(folder, contexts, config, load_probe(shipped_model(config.task), device))
     with _clip_judge(config, run_dir, contexts, clip_fps(bags[0], config.model.stride)) as judge:
         recordings = recorded_buffers.recorded_bags(run_dir)
         clips = chain.from_iterable(recorded_buffers.read_clips(recording, pictures=True) for recording in recordings)
-        rows = list[Rescored]()
-        for recorded in tqdm(clips, desc="rescoring", unit="buffer"):
-            first, given = recorded_place(config, recorded.iteration)
-            rows.append(recorded_buffers.rescore(
-                recorded, contexts, probe, folder.codec, config.rewards, given, judge, first, execution
-            ))
+        shown = tqdm(clips, desc="rescoring", unit="buffer")
+        rows = [recorded_buffers.rescore(recorded, source, judge) for recorded in shown]
     equal = all(not row.different for row in rows)
     words = "every score is the recorded one, bit for bit" if equal else "scores differ from the bag's"
     if not all(row.same_reward for row in rows):
@@ -180,12 +175,14 @@ def _clip_judge(config: VideoRlConfig, run_dir: Path, contexts: Clips, fps: floa
         yield None
         return
 
-    def verdicts(recorded: RecordedClips, frames: Tensor, references: Clips) -> JudgedBuffer:
+    def verdicts(
+        recorded: RecordedClips, frames: Tensor, references: Clips
+    ) -> tuple[Mapping[str, Tensor], tuple[Mapping[str, Any], ...]]:
         jobs = buffer_jobs(
             frames, references, recorded.sha256, config, given=config.model.num_conditioning, fps=fps
         )
         found = judge.judge(jobs)
-        return JudgedBuffer(agent_scores(found), tuple(verdict_row(verdict) for verdict in found))
+        return agent_scores(found), tuple(verdict_row(verdict) for verdict in found)
 
     settings = for_task(judge_or_embedded(config.judge), config.task)
     judge = JudgeService(

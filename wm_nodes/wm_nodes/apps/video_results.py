@@ -35,9 +35,10 @@ from wm_nodes.video_model.success_reader import reader_of
 from wm_nodes.video_rl.heldout_metrics import load_or_measure_unrewarded, make_yardstick
 from wm_nodes.video_rl.pretraining import BEFORE
 from wm_nodes.video_rl.reference_reward import more_is_better
+from wm_nodes.video_rl.reward_hacking import SECTION, WATCHED, alarm_text, hacked_slopes
 from wm_nodes.video_rl.sampling import sample_by_ode
 from wm_nodes.video_rl.training_run import VIDEO_FILES
-from wm_nodes.video_rl.validation import SECTION, WATCHED, alarm_text, alarms_of, load_or_measure_scores
+from wm_nodes.video_rl.validation import load_or_measure_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
 AFTER, UNREWARDED = (Path("evaluations") / name for name in ("after.json", "unrewarded.json"))
@@ -80,9 +81,8 @@ def conclude(
         executed=len(found.before.get("executed_success", ())), not_measured=found.missing,
         evaluations=len(lines), watched=[name for name in WATCHED if watched and name in watched[-1]],
         hacked=None if not watched else [
-            {"step": line["step"], "reward_slope": alarms[0].proxy_slope,
-             "slopes": {alarm.metric: alarm.true_slope for alarm in alarms}, "text": alarm_text(alarms)}
-            for line in watched if (alarms := alarms_of(line))
+            {"step": line["step"], "reward_slope": line["reward_slope"], "slopes": hacked_slopes(line),
+             "text": alarm_text(line)} for line in watched if line["hacked"]
         ],
         bag=bag, minutes=minutes, command=command, machine=machine_facts(config.device), date=time.strftime("%Y-%m-%d"),
     ))

@@ -2,6 +2,7 @@
 
 import os
 import time
+from collections.abc import Sequence
 from enum import Enum
 from pathlib import Path
 
@@ -15,6 +16,11 @@ def stat_fields(pid: int) -> list[str]:
         return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
     except OSError:
         return []
+
+
+def used_cpu_s(fields: Sequence[str]) -> float:
+    """CPU time of a process and its threads, user and system, by its stat_fields."""
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 class Activity(Enum):
@@ -39,7 +45,7 @@ class ActivityWatch:
         if not fields:
             self._seen.pop(pid, None)
             return Activity.GONE
-        state, cpu_s = fields[0], (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        state, cpu_s = fields[0], used_cpu_s(fields)
         before_s, before_cpu_s = self._seen.get(pid, (now, cpu_s))
         if now != before_s or pid not in self._seen:
             self._seen[pid] = now, cpu_s

@@ -116,7 +116,7 @@ class ClipEvaluatorNode(ManagedNode):
         self, request: GroupRequest, buffer: RolloutBuffer, frames: torch.Tensor, verdicts: Sequence[Verdict],
         sha256: str,
     ) -> ClipScores:
-        scores = self._source.scores(request, frames, buffer.condition.num_conditioning)
+        scores = self._source.scores(request, frames)
         if self._agent is not None:
             scores |= agent_scores(verdicts)
         total = mix_rewards(scores, self._config.rewards)

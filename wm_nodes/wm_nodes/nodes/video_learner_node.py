@@ -27,9 +27,10 @@ from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import BufferReport
 from wm_nodes.video_rl.reference_reward import attach_rewards
+from wm_nodes.video_rl.reward_hacking import alarm_text
 from wm_nodes.video_rl.train import post_train, sample_buffers
 from wm_nodes.video_rl.training_run import VideoRun
-from wm_nodes.video_rl.validation import alarm_text, validation_scores
+from wm_nodes.video_rl.validation import validation_scores
 
 PARAMS = (
     Param("video_model_dir", "", "Folder of the video model that training starts from", read_only=True),
@@ -60,7 +61,7 @@ class VideoLearnerNode(TrainingNode):
         values = {param.name: self.param(param.name) for param in (*COMMON, *PARAMS)}
         self._video = make_run(values, self.run_dir, self.ranks)
         self.own(self._video.close)
-        self._watched, self.files = self._video.hacked, named_files(self)
+        self._watched, self.files = self._video.alarms, named_files(self)
         self._start_barrier = StartBarrier(self, self.links.table)
         self.generate = GuardedActionClient(self, GenerateClips, "video/generate")
         self.evaluate = GuardedActionClient(self, EvaluateClips, "clips/evaluate")
@@ -113,9 +114,9 @@ class VideoLearnerNode(TrainingNode):
 
     def _warn_of_hacking(self) -> None:
         """Say what a new held-out evaluation says of reward hacking."""
-        if self._video.hacked is self._watched:
+        if self._video.alarms is self._watched:
             return
-        self._watched = self._video.hacked
+        self._watched = self._video.alarms
         text = alarm_text(self._watched)
         if text:
             self.get_logger().warning(f"reward hacking: {text}")

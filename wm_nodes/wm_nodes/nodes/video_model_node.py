@@ -26,7 +26,7 @@ from wm_nodes.training.run_folder import VersionFiles
 from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
-from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.sampling import RecordedContexts
 
 PARAMS = (
     Param("video_model_dir", "", "Folder of the trained video model", read_only=True),
@@ -52,7 +52,8 @@ class VideoModelNode(ManagedNode):
         config = load_video_config(str(self.param("config_file")))
         folder = load_video_folder(Path(str(self.param("video_model_dir"))), compute_device(config.device))
         bags = [Path(text) for text in self.param("context_bags") if text]
-        self._generator = ClipGenerator(folder, load_clips(bags, folder.clip["stride"], config.clip_steps), config)
+        contexts = load_clips(bags, folder.clip["stride"], config.clip_steps)
+        self._generator = RecordedContexts(folder, contexts, config)
         self._files = named_files(self)
         self._loaded = (0, "")  # version and, unless it is the folder's own, sha256
         self._announced = dict[int, PolicyVersion]()

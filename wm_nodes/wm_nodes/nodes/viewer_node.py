@@ -1,12 +1,18 @@
 """viewer: the live page of a graph, see reports/live_page.py. It listens, and nobody waits for it: it has no lifecycle,
-announces no links, grants no credit, and hears what is not latched as best effort."""
+announces no links, grants no credit, and hears what is not latched as best effort.
+
+What comes with every step, and pictures, it subscribes to only while somebody looks.
+"""
 
 import gc
+import math
 import os
 import sys
+import time
 from copy import copy
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import rclpy
 from rclpy.clock import Clock, ClockType
@@ -14,7 +20,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 
-from wm_nodes.nodes.viewer.feed import TABLE_S, TYPES, VIEW, Feed
+from wm_nodes.nodes.viewer.feed import PER_STEP, TABLE_S, TYPES, VIEW, Feed
 from wm_nodes.nodes.viewer.run_folder import RunFolder
 from wm_nodes.recording import topics
 from wm_nodes.reports.live_page import LivePage
@@ -29,6 +35,8 @@ NICENESS = 10
 DEPTH = 64
 SIMULATOR = "sim/"
 """Below the graph's namespace: the environment that the policy is measured in."""
+GRACE_S = 5.0
+"""A page that is loaded again, or connects again, within this time has never been away."""
 
 
 class ViewerNode(Node):  # type: ignore[misc]
@@ -39,17 +47,42 @@ class ViewerNode(Node):  # type: ignore[misc]
         declare(self, (*COMMON, *PARAMS))
         run_dir = str(self.get_parameter("run_dir").value)
         self.page = LivePage(int(self.get_parameter("port").value))
-        feed = Feed(self.page, RunFolder(Path(run_dir)) if run_dir else None, namespace=self.get_namespace())
+        self._feed = Feed(self.page, RunFolder(Path(run_dir)) if run_dir else None, namespace=self.get_namespace())
         of_simulator = [name for name in TYPES if name.startswith("env/")]
         of_simulator += [topics.EPISODE.name, topics.RUN_STATE.name]
-        for name in (*TYPES, *(SIMULATOR + name for name in of_simulator)):
-            base = name.removeprefix(SIMULATOR)
-            if base != topics.IMAGES.name:  # all environments in one picture: too much for looking on
-                kind, profile = (Image, _passing()) if base == VIEW else (topic(base).type, _hearing(base))
-                absolute = self.resolve_topic_name(name)
-                self.create_subscription(kind, name, partial(feed.put, absolute), profile, raw=True)
-        self.create_timer(TABLE_S, feed.tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        shown = [*TYPES, *(SIMULATOR + name for name in of_simulator)]
+        shown = [name for name in shown if _base(name) != topics.IMAGES.name]  # all environments: too much for looking
+        self._only_watched = [name for name in shown if _base(name) in PER_STEP]
+        self._while_watched: list[Any] = []
+        """Their subscriptions, while somebody looks."""
+        self._watched_s = -math.inf
+        for name in shown:
+            if _base(name) not in PER_STEP:
+                self._hear(name)
+        self.create_timer(TABLE_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(f"live page {self.page.url}")
+
+    def _hear(self, name: str) -> Any:
+        base, absolute = _base(name), self.resolve_topic_name(name)
+        kind, profile = (Image, _passing()) if base == VIEW else (topic(base).type, _hearing(base))
+        return self.create_subscription(kind, name, partial(self._feed.put, absolute), profile, raw=True)
+
+    def _tick(self) -> None:
+        """Show what is due to those who look; begin and end, on this thread, what only they cause."""
+        now = time.monotonic()
+        if self.page.browsers:
+            self._watched_s = now
+            self._feed.tick()
+        watched = now - self._watched_s < GRACE_S
+        if watched and not self._while_watched:
+            self._while_watched = [self._hear(name) for name in self._only_watched]
+        while self._while_watched and not watched:
+            self.destroy_subscription(self._while_watched.pop())
+
+
+def _base(name: str) -> str:
+    """A topic's name without the simulator's namespace."""
+    return name.removeprefix(SIMULATOR)
 
 
 def _passing() -> QoSProfile:

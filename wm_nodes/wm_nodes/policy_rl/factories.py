@@ -32,7 +32,7 @@ from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import load_weights_file
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_model.success_reader import SuccessReader, load_success_reader
-from wm_nodes.video_model.video_environment import VideoEnvironment, check_steppable
+from wm_nodes.video_model.video_environment import VideoEnvironment, VideoEpisodes, check_steppable
 from wm_nodes.world_model import (
     DeviceEnvironment,
     ImaginedEnvironment,
@@ -212,10 +212,11 @@ def make_video_environment(
     folder, reader = load_steppable(config, video_model_dir)
     spec = configured_spec(config, num_envs)
     with explain_memory(folder.device, ppo__num_envs=num_envs):
-        environment = VideoEnvironment(
+        episodes = VideoEpisodes(
             folder, reader, spec, load_starts(Path(starts_file), config.task), config.reward, config.video_environment,
-            num_envs=num_envs, seed=seed,
+            num_envs=num_envs,
         )
+    environment = VideoEnvironment(episodes, seed=seed)
     environment.cameras = _cameras(config, environment)
     return environment
 

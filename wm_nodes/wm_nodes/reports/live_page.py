@@ -9,7 +9,8 @@ import hashlib
 import json
 import re
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler
 from socketserver import ThreadingTCPServer
 from typing import Any
@@ -46,7 +47,8 @@ class LivePage:
         self._panels: dict[str, tuple[int, bytes]] = {}
         """The number of its change, and the event that a browser gets."""
         self._changes, self._closed = 0, False
-        self.seats = threading.Semaphore(BROWSERS)
+        self.browsers = 0
+        """How many look now."""
         try:
             self._server = _Server(self, port)
         except OSError as error:
@@ -74,6 +76,18 @@ class LivePage:
             if self._closed:
                 raise ConnectionAbortedError
             return self._changes, [event for number, event in self._panels.values() if number > seen]
+
+    @contextmanager
+    def seat(self) -> Iterator[bool]:
+        """Whether one more browser may look; if so, it counts among `browsers` until the context ends."""
+        with self._changed:
+            seated = self.browsers < BROWSERS
+            self.browsers += seated
+        try:
+            yield seated
+        finally:
+            with self._changed:
+                self.browsers -= seated
 
     def close(self) -> None:
         """Let the browsers go and free the port."""
@@ -114,14 +128,13 @@ class _Browser(BaseHTTPRequestHandler):
             self.wfile.write(page.html)
         elif self.path != "/events":
             self.send_error(404)
-        elif not page.seats.acquire(blocking=False):
-            self.send_error(503, f"{BROWSERS} browsers look already; close one")
         else:
-            try:
-                self._begin("text/event-stream", {})
-                self._tell(page)
-            finally:
-                page.seats.release()
+            with page.seat() as seated:
+                if seated:
+                    self._begin("text/event-stream", {})
+                    self._tell(page)
+                else:
+                    self.send_error(503, f"{BROWSERS} browsers look already; close one")
 
     def log_message(self, *arguments: Any) -> None:
         """Nobody reads who looked."""

@@ -7,6 +7,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
@@ -14,12 +15,12 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from wm_nodes.config.video import RolloutConfig
-from wm_nodes.training.checkpoint import metadata_of
+from wm_nodes.training.checkpoint import metadata_of, section
 from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.sampling import ROWS, VideoRollout
 
 _METADATA_KEY = "rollout_buffer"
-_ROLLOUT_TENSORS = (*ROWS, "noise_share")
+_HEADER = ("policy_version", "iteration", "config_hash")
 
 
 class RolloutBufferError(ValueError):
@@ -104,19 +105,18 @@ class RolloutBuffer:
 
     def to_bytes(self) -> bytes:
         """One safetensors file; from_bytes gives an equal buffer."""
-        header = {
-            "steps": self.rollout.steps,
-            "policy_version": self.policy_version,
-            "iteration": self.iteration,
-            "config_hash": self.config_hash,
+        header = {"steps": self.rollout.steps, **{name: getattr(self, name) for name in _HEADER}}
+        # safetensors refuses memory under two names, e.g. a total of one reward
+        parts: dict[str, Mapping[str, Any]] = {
+            "rollout": vars(self.rollout), "condition": vars(self.condition),
+            "reward": {name: value.clone() for name, value in self.rewards.items()},
         }
-        tensors, seen = self._tensors(), set[int]()
-        for name, tensor in tensors.items():  # safetensors refuses memory under two names, e.g. a total of one reward
-            if tensor.data_ptr() in seen:
-                tensors[name] = tensor.clone()
-            seen.add(tensor.data_ptr())
-        tensors = {name: tensor.cpu() for name, tensor in tensors.items()}
-        data: bytes = save(tensors, {_METADATA_KEY: json.dumps(header)})
+        tensors = {
+            f"{part}.{name}": value.cpu().contiguous()
+            for part, values in parts.items() for name, value in values.items() if isinstance(value, Tensor)
+        }
+        ids = {"group_ids": self.group_ids, "sample_ids": self.sample_ids.clone()}
+        data: bytes = save({**tensors, **ids}, {_METADATA_KEY: json.dumps(header)})
         return data
 
     @classmethod
@@ -126,34 +126,18 @@ class RolloutBuffer:
         try:
             tensors: dict[str, Tensor] = load(data)
             header = json.loads(metadata_of(data)[_METADATA_KEY])
-            rollout = {name: tensors[f"rollout.{name}"] for name in _ROLLOUT_TENSORS}
             for name, values in tensors.items():
                 if name.startswith("condition.") or name.removeprefix("rollout.") in ROWS:
                     _check_finite(name, values)
-            rewards = sorted(name for name in tensors if name.startswith("reward."))
             return cls(
-                rollout=VideoRollout(**rollout, steps=tuple(header["steps"])),
-                condition=Condition(
-                    tensors["condition.frames"], tensors["condition.actions"], tensors["condition.text"]
-                ),
-                group_ids=tensors["group_ids"],
-                sample_ids=tensors["sample_ids"],
-                rewards={name.removeprefix("reward."): tensors[name] for name in rewards},
-                policy_version=header["policy_version"],
-                iteration=header["iteration"],
-                config_hash=header["config_hash"],
+                VideoRollout(**section(tensors, "rollout."), steps=tuple(header["steps"])),
+                Condition(**section(tensors, "condition.")), tensors["group_ids"], tensors["sample_ids"],
+                dict(sorted(section(tensors, "reward.").items())), **{name: header[name] for name in _HEADER},
             )
         except (SafetensorError, KeyError, TypeError, json.JSONDecodeError, UnicodeDecodeError) as error:
             raise RolloutBufferError(
                 f"these {len(data)} bytes are no complete rollout buffer ({error}); sample again"
             ) from error
-
-    def _tensors(self) -> dict[str, Tensor]:
-        tensors = {f"rollout.{name}": getattr(self.rollout, name) for name in _ROLLOUT_TENSORS}
-        tensors |= {f"condition.{name}": getattr(self.condition, name) for name in ("frames", "actions", "text")}
-        tensors |= {f"reward.{name}": value for name, value in self.rewards.items()}
-        tensors |= {"group_ids": self.group_ids, "sample_ids": self.sample_ids}
-        return {name: tensor.contiguous() for name, tensor in tensors.items()}
 
 
 def _check_finite(name: str, values: Tensor) -> None:

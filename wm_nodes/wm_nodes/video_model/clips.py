@@ -89,7 +89,7 @@ def load_clips(bags: Sequence[Path], stride: int, steps: int = 0) -> Clips:
         BagError: a bag is missing, damaged, or of another version. ValueError: no episodes, of different sizes or
             lengths, or with an action or simulator state that is no number.
     """
-    episodes = [_with_truth(checked(episode, bag)) for bag in bags for episode in read_episodes(bag)]
+    episodes = [checked(episode, bag) for bag in bags for episode in read_episodes(bag)]
     lengths = [episode.num_steps for episode in episodes]
     if not steps and len(set(lengths)) > 1:
         raise ValueError(
@@ -105,7 +105,8 @@ def load_clips(bags: Sequence[Path], stride: int, steps: int = 0) -> Clips:
 
 
 def checked(episode: Episode, bag: Path) -> Episode:
-    """The episode, whose actions are numbers, and each value of the simulator state in all frames or in none.
+    """The episode, whose actions are numbers, and each value of the simulator state in all frames or in none; recorded
+    without simulator state, with an unknown one.
 
     Raises:
         ValueError: another one; names the first wrong value.
@@ -119,12 +120,7 @@ def checked(episode: Episode, bag: Path) -> Episode:
                 f"{bag}: episode {episode.episode_id}: {name}{list(place)} is {getattr(episode, name)[place]}; record "
                 "the episode again, or leave its bag out"
             )
-    return episode
-
-
-def _with_truth(episode: Episode) -> Episode:
-    """The episode; recorded without simulator state, with an unknown one."""
-    if episode.ground_truth.shape[1]:
+    if truth.shape[1]:
         return episode
     names = get_task(episode.task).ground_truth_names
     return replace(episode, ground_truth=np.full((len(episode.images), len(names)), np.nan, np.float32))

@@ -7,7 +7,6 @@ float64 and cast to the dtype of x; no gradient reaches the standard deviation o
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -50,12 +49,23 @@ class Step(NamedTuple):
     """(B, 1, F, H, W), 0 on conditioning frames."""
 
 
-Kernel = Callable[[Tensor, Tensor, Tensor, Tensor, StepContext, SamplerConfig], Step]
-
-
 def step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerConfig) -> Step:
-    """Return the Gaussian of x_s given x_t = x and the velocity v, by the arm of the settings."""
-    return KERNELS[settings.arm](x, v, t, s, context, settings)
+    """Return the Gaussian of x_s given x_t = x and the velocity v, by the arm of the settings.
+
+    cps and dyndiff preserve coefficients (DD-4), with the same sigma in every cell, or that of DD-5.
+    """
+    if settings.arm == "ode":
+        return ode_step(x, v, t, s, context)
+    generated = _generated(x, context)
+    if variance := VARIANCES.get(settings.arm):
+        return _euler_sde(x, v, t, s, variance(t, s, settings.eta**2, context.first_time), generated)
+    x0, eps = estimates(x, v, t)
+    if settings.arm == "cps":
+        return _preserving_step(x0, eps, s, generated, settings)
+    mask = rollout_mask(x0, context, settings) if context.mask is None else context.mask
+    if mask.shape != generated.shape:
+        raise ValueError(f"mask must be {tuple(generated.shape)} for latents {tuple(x.shape)}, got {tuple(mask.shape)}")
+    return _preserving_step(x0, eps, s, mask.to(x.dtype), settings)
 
 
 def estimates(x: Tensor, v: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
@@ -69,27 +79,10 @@ def with_conditioning(x: Tensor, conditioning: Tensor) -> Tensor:
     return x if K == 0 else torch.cat([conditioning.to(x.dtype), x[:, :, K:]], 2)
 
 
-def ode_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerConfig) -> Step:
+def ode_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext) -> Step:
     """The Euler step x + (s - t) v."""
     still = _generated(x, context)
     return Step(x + _rows(s - t, x) * v, torch.zeros_like(still), still)
-
-
-def cps_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerConfig) -> Step:
-    """Coefficient-preserving sampling: DD-4 with the same sigma in every cell."""
-    return _preserving_step(*estimates(x, v, t), s, _generated(x, context), settings)
-
-
-def dyndiff_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerConfig) -> Step:
-    """DD-4 with the sigma of DD-5."""
-    x0, eps = estimates(x, v, t)
-    mask = context.mask
-    if mask is None:
-        mask = rollout_mask(x0, context, settings)
-    elif mask.shape != (x.shape[0], 1, *x.shape[2:]):
-        expected = (x.shape[0], 1, *x.shape[2:])
-        raise ValueError(f"mask must be {expected} for latents {tuple(x.shape)}, got {tuple(mask.shape)}")
-    return _preserving_step(x0, eps, s, mask.to(x.dtype), settings)
 
 
 @torch.no_grad()
@@ -113,44 +106,34 @@ def masked_deviation(mask: Tensor, s: Tensor, settings: SamplerConfig) -> Tensor
     return torch.where(mask > 1, torch.minimum(sigma, SIGMA_LIMIT * _rows(s, mask)), sigma)
 
 
-def _euler_sde(x: Tensor, v: Tensor, t: Tensor, s: Tensor, variance: Tensor, context: StepContext) -> Step:
+def _euler_sde(x: Tensor, v: Tensor, t: Tensor, s: Tensor, variance: Tensor, generated: Tensor) -> Step:
     """mean x + (s - t) v - Sigma^2 / (2 t) eps, std Sigma: the common form of Flow-GRPO, DanceGRPO and SAGE (DD-21)."""
     _, eps = estimates(x, v, t)
     variance = torch.where(s > 0, variance, 0.0)
-    std = _rows(variance.sqrt(), x)
     mean = x + _rows(s - t, x) * v - _rows(variance / (2 * t), x) * eps
-    generated = _generated(x, context)
-    return Step(mean, std * generated, generated)
+    return Step(mean, _rows(variance.sqrt(), x) * generated, generated)
 
 
-def flow_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerConfig) -> Step:
+def flow_variance(t: Tensor, s: Tensor, power: float, first_time: float) -> Tensor:
     """Flow-GRPO (DD-22): Sigma^2 = a^2 t / (1 - t~) (t - s), t~ = t_1 at the first step (in the denominator only)."""
-    denominator = 1 - torch.where(t >= 1, torch.full_like(t, context.first_time), t)
-    return _euler_sde(x, v, t, s, settings.eta**2 * t / denominator * (t - s), context)
+    return power * t / (1 - torch.where(t >= 1, torch.full_like(t, first_time), t)) * (t - s)
 
 
-def dance_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerConfig) -> Step:
+def dance_variance(t: Tensor, s: Tensor, power: float, first_time: float) -> Tensor:
     """DanceGRPO (DD-23): Sigma^2 = eta^2 (t - s)."""
-    return _euler_sde(x, v, t, s, settings.eta**2 * (t - s), context)
+    return power * (t - s)
 
 
-def sage_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerConfig) -> Step:
+def sage_variance(t: Tensor, s: Tensor, power: float, first_time: float) -> Tensor:
     """SAGE (DD-24): Sigma^2 = eta^2 (ln((1 - s) / (1 - t~)) - (t - s)), t~ = min(t, 0.997).
 
     Up to t = 0.997 this is the integral of eta^2 tau / (1 - tau) from s to t.
     """
-    variance = settings.eta**2 * (torch.log((1 - s) / (1 - t.clamp_max(SAGE_LATEST))) - (t - s))
-    return _euler_sde(x, v, t, s, variance.clamp_min(0), context)
+    return (power * (torch.log((1 - s) / (1 - t.clamp_max(SAGE_LATEST))) - (t - s))).clamp_min(0)
 
 
-KERNELS: dict[str, Kernel] = {
-    "ode": ode_step,
-    "cps": cps_step,
-    "dyndiff": dyndiff_step,
-    "flow": flow_step,
-    "dance": dance_step,
-    "sage": sage_step,
-}
+VARIANCES = {"flow": flow_variance, "dance": dance_variance, "sage": sage_variance}
+"""(t, s, eta^2, first time) -> Sigma^2, (B,)."""
 
 
 def _generated(x: Tensor, context: StepContext) -> Tensor:

@@ -152,7 +152,7 @@ def _sample(
         t, s = at[k].expand(N), at[k + 1].expand(N)
         v = guided_velocity(model, x, t, condition, settings.cfg).float()
         if k not in rollout.steps:
-            x = with_conditioning(ode_step(x, v, t, s, context, settings.sampler).mean, context.conditioning)
+            x = with_conditioning(ode_step(x, v, t, s, context).mean, context.conditioning)
             continue
         law = step(x, v, t, s, context, settings.sampler)
         z = step_noise(tuple(x.shape[1:]), seeds, k).to(x.device)
@@ -173,17 +173,13 @@ def keep_transition(rollout: VideoRollout, k: int, x_s: Tensor, law: Step) -> No
     """Write what training needs of step k beside its states: mask and normalised noise."""
     i = rollout.steps.index(k)
     rollout.mask[:, i] = law.mask
-    num_conditioning = x_s.shape[2] - rollout.zeta.shape[3]
-    if rollout.zeta.dtype == torch.float32 and rollout.zeta.device == x_s.device:
-        normalised_noise(x_s, law, num_conditioning, out=rollout.zeta[:, i])
-    else:
-        rollout.zeta[:, i] = normalised_noise(x_s, law, num_conditioning)
+    rollout.zeta[:, i] = normalised_noise(x_s, law, x_s.shape[2] - rollout.zeta.shape[3])
 
 
-def normalised_noise(x_s: Tensor, law: Step, num_conditioning: int, out: Tensor | None = None) -> Tensor:
-    """Return zeta of DD-14b, (x_s - mean) / std on generated frames, (N, C, F - K, H, W), in `out` where given."""
+def normalised_noise(x_s: Tensor, law: Step, num_conditioning: int) -> Tensor:
+    """Return zeta of DD-14b, (x_s - mean) / std on generated frames, (N, C, F - K, H, W)."""
     K = num_conditioning
-    return torch.sub(x_s[:, :, K:], law.mean[:, :, K:], out=out).div_(law.std[:, :, K:])
+    return (x_s[:, :, K:] - law.mean[:, :, K:]).div_(law.std[:, :, K:])
 
 
 class GaussianTransition(NamedTuple):

@@ -23,51 +23,33 @@ from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import CODEC, load_module, read_video_manifest
 from wm_nodes.video_model.tokenizer_codec import Codec
+from wm_nodes.world_model.position_probe import PictureReader, halving_convolutions
 
 CHANNELS, HIDDEN = (16, 32, 32, 48), 48
-BATCH = 256
 LEARNING_RATE, TRAINING_BATCH, PIXEL_NOISE = 2.0e-3, 96, 0.02
 CALIBRATION_SHARE = 0.2
 """Of the training episodes, the last ones: they choose the threshold and are not trained on."""
 WEIGHTS, SUCCESS_MANIFEST, FORMAT = "success.safetensors", "success.json", 1
 
 
-class SuccessReader(nn.Module):
+class SuccessReader(PictureReader):
     """A small convolutional classifier of single pictures; `threshold` is the probability from which a task is done."""
 
     def __init__(self, height: int, width: int, threshold: float = 0.5) -> None:
-        super().__init__()
-        self.height, self.width, self.threshold = height, width, threshold
-        layers: list[nn.Module] = []
-        previous = 3
-        for channels in CHANNELS:
-            layers += [nn.Conv2d(previous, channels, 5, stride=2, padding=2), nn.SiLU()]
-            previous = channels
-        cells = [-(-size // 2 ** len(CHANNELS)) for size in (height, width)]
-        self.layers = nn.Sequential(
-            *layers, nn.Flatten(), nn.Linear(previous * cells[0] * cells[1], HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, 1)
-        )
+        super().__init__(height, width)
+        self.threshold = threshold
+        layers, values = halving_convolutions(CHANNELS, height, width)
+        self.layers = nn.Sequential(*layers, nn.Linear(values, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, 1))
 
     def forward(self, pixels_B3HW: Tensor) -> Tensor:
         """Logits (B,); pixels float in [0, 1]."""
         logits: Tensor = self.layers(2 * pixels_B3HW - 1)[:, 0]
         return logits
 
-    @torch.inference_mode()
     def read(self, images: UInt8Array | Tensor) -> FloatArray:
-        """Probability (...,) that the task is done in each of uint8 images (..., H, W, 3).
-
-        Raises:
-            ValueError: images of another size than it was trained on.
-        """
-        tensor = torch.as_tensor(images)
-        if tuple(tensor.shape[-3:]) != (self.height, self.width, 3):
-            raise ValueError(f"images must be (..., {self.height}, {self.width}, 3), got {tuple(tensor.shape)}; train "
-                             "a success reader for this camera set-up")
-        device = next(self.parameters()).device
-        parts = torch.split(tensor.reshape(-1, *tensor.shape[-3:]), BATCH)  # type: ignore[no-untyped-call]
-        found = torch.cat([torch.sigmoid(self(_pixels(part.to(device)))) for part in parts])
-        probabilities: FloatArray = found.cpu().numpy().reshape(tensor.shape[:-3])
+        """Probability (...,) that the task is done in each of uint8 images (..., H, W, 3). Raises ValueError as
+        read_values."""
+        probabilities: FloatArray = torch.sigmoid(self.read_values(images)).cpu().numpy().reshape(images.shape[:-3])
         return probabilities
 
     def done(self, images: UInt8Array | Tensor) -> BoolArray:
@@ -101,7 +83,7 @@ def train_success_reader(
 
     def loss(iteration: int) -> dict[str, Tensor]:
         rows = numpy_stream(seed, "success_reader_batch", iteration).choice(len(pictures), TRAINING_BATCH)
-        shown = _pixels(pictures[torch.from_numpy(rows)])
+        shown = reader.pixels(pictures[torch.from_numpy(rows)])
         noise = torch.randn(shown.shape, generator=torch_stream(seed, "success_reader_noise", iteration))
         target = torch.from_numpy(wanted[rows]).float()
         return {"loss": F.binary_cross_entropy_with_logits(reader(shown + PIXEL_NOISE * noise), target)}
@@ -161,11 +143,6 @@ def _seen_through(folder: Path) -> tuple[str, int]:
     """The sha256 of a video model's codec, and the stride of its clips."""
     manifest = read_video_manifest(folder)
     return manifest["sha256"][CODEC], manifest["clip"]["stride"]
-
-
-def _pixels(images: Tensor) -> Tensor:
-    """Float (B, 3, H, W) in [0, 1] of uint8 images (B, H, W, 3)."""
-    return images.permute(0, 3, 1, 2).float() / 255
 
 
 def _mean(values: NDArray[Any]) -> float:

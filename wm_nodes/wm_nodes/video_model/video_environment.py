@@ -35,13 +35,22 @@ class DoneSignal(Protocol):
 
 class VideoEpisodes(DeviceEpisodes):
     """Imagined episodes of a video model, one sampled frame per step. The done signal is that of `reader`; nothing
-    estimates its uncertainty, which is 0, and no goals are imagined. Arguments as VideoEnvironment's."""
+    estimates its uncertainty, which is 0, and no goals are imagined.
+
+    Args:
+        spec, starts, reward: as DeviceEpisodes's; the spec is that of the simulator the model was learned from.
+        settings: of the sampler, an ODE.
+        exact: compute in float32 even where bfloat16 is faster.
+
+    Raises:
+        ValueError: a model that cannot be stepped, or of another task or robot; starts of another picture size.
+    """
 
     kind = "video model"
 
     def __init__(
         self, folder: VideoFolder, reader: DoneSignal, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray],
-        reward: RewardConfig, settings: VideoEnvironmentConfig, *, num_envs: int, exact: bool,
+        reward: RewardConfig, settings: VideoEnvironmentConfig, *, num_envs: int, exact: bool = False,
     ) -> None:
         check_steppable(folder, spec)
         device = folder.device
@@ -118,25 +127,9 @@ class VideoEnvironment(ImaginedEpisodes):
 
     The initial noise of a frame comes from the stream (seed of the reset, `video_step`, step), so an episode is the
     same in any batch; on a CPU bit for bit.
-
-    Args:
-        spec, starts, reward: as DeviceEpisodes's; the spec is that of the simulator the model was learned from.
-        settings: of the sampler, an ODE.
-        exact: compute in float32 even where bfloat16 is faster.
-
-    Raises:
-        ValueError: a model that cannot be stepped, or of another task or robot; starts of another picture size.
     """
 
     episodes: VideoEpisodes
-
-    def __init__(
-        self, folder: VideoFolder, reader: DoneSignal, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray],
-        reward: RewardConfig, settings: VideoEnvironmentConfig, *, num_envs: int, seed: int = 0, exact: bool = False,
-    ) -> None:
-        super().__init__(
-            VideoEpisodes(folder, reader, spec, starts, reward, settings, num_envs=num_envs, exact=exact), seed=seed
-        )
 
     def _noise(self) -> Tensor:
         seeds = [

@@ -56,7 +56,7 @@ def examine(
 
     Args:
         condition: of N >= 2 videos, where the model is; two of them at least should move.
-        config: its seed, groups (for the memory of a buffer), window, rollout and grpo are used.
+        config: its seed, window, rollout and grpo are used.
 
     Raises:
         ValueError: nothing can be trained with these settings: a sampler without noise, no step that can train, an
@@ -68,8 +68,12 @@ def examine(
     model.eval()
     buffer = sample_buffer(model, config, condition, noise, seeds, group, videos, 0, 0)
     sampled, trainable = buffer.rollout, [p.requires_grad for p in model.parameters()]
-    if not bool(sampled.latents.isfinite().all()):
-        return [_report_not_finite(sampled)]
+    broken = (~sampled.latents.isfinite()).flatten(1).any(1)
+    if bool(broken.any()):
+        return [CheckResult(
+            "sampled videos are finite", False, f"{int(broken.sum())} of {len(broken)} are not",
+            "float16 overflows where bfloat16 does not; check the weights, and the latents' scale",
+        )]
     try:
         learner = GrpoLearner(model, _without_updates(config.grpo, rollout), rollout, seed=config.seed)
         first = _check_first_update(learner, buffer)
@@ -83,16 +87,7 @@ def examine(
         _check_ode(model, condition, noise, seeds, rollout),
         _check_mask(sampled, condition.num_conditioning, rollout),
         _check_round_trip(buffer),
-        _measure_memory(learner, sampled, config.groups.contexts * config.groups.group_size),
     ]
-
-
-def _report_not_finite(sampled: VideoRollout) -> CheckResult:
-    broken = int((~sampled.latents.isfinite()).flatten(1).any(1).sum())
-    return CheckResult(
-        "sampled videos are finite", False, f"{broken} of {len(sampled.latents)} are not",
-        "float16 overflows where bfloat16 does not; check the weights, and the latents' scale",
-    )
 
 
 def _check_ode(
@@ -141,17 +136,6 @@ def _check_round_trip(buffer: RolloutBuffer) -> CheckResult:
     data = buffer.to_bytes()
     equal, size = RolloutBuffer.from_bytes(data).to_bytes() == data, f"{len(data) / MIB:.1f} MiB"
     return CheckResult("a saved buffer comes back equal", equal, size, "report this as a bug")
-
-
-def _measure_memory(learner: GrpoLearner, sampled: VideoRollout, videos: int) -> CheckResult:
-    """Measure what each KL anchor keeps beside the weights, for a buffer of `videos` videos."""
-    weights, scale = sum(p.nbytes for p in learner.parameters), videos / len(sampled.latents) / MIB
-    text = (
-        f"frozen: {weights / MIB:.2f} MiB of weights that train; buffer: {sampled.zeta.nbytes * scale:.2f} MiB of "
-        f"noise and {sampled.mask.nbytes * scale:.2f} MiB of masks for {videos} videos; dual: both; lora_off: nothing; "
-        f"chosen: {learner.settings.kl.anchor}"
-    )
-    return CheckResult("memory of the KL anchors", True, text, "")
 
 
 def _limits(rollout: RolloutConfig) -> tuple[float, float]:

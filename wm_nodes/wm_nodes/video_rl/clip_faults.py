@@ -55,25 +55,6 @@ class FaultLimits:
     from both."""
 
 
-@dataclass(frozen=True)
-class ClipFaults:
-    """Per clip, float64 (N,)."""
-
-    ghost_motion: Tensor
-    """Share of generated steps in which the object moves by more than 2 cm while the tool's point is more than 10 cm
-    (3-D) from the object's centre in both frames."""
-    impossible_tool_steps: Tensor
-    """Share of tool steps longer than the limit."""
-    object_permanence: Tensor
-    """1 where the last frame shows at least the limit of pixels that have the colour which the first frame shows at the
-    object's place."""
-    scenery_change: Tensor
-    """Mean absolute change since the first frame, [0, 1], of the still cameras' pixels far from tool and object."""
-
-    def named(self) -> dict[str, Tensor]:
-        return dict(vars(self))
-
-
 def measure_fault_limits(frames: Tensor, positions: FloatArray, scene: FilmedScene) -> FaultLimits:
     """Return the 0.99 quantile of tool steps, and the 0.01 quantile of the object's pixels in last frames, of recorded
     clips, uint8 (N, F, H, W, 3), that went through the codec of the clips to be compared, at their stride.
@@ -88,8 +69,15 @@ def measure_fault_limits(frames: Tensor, positions: FloatArray, scene: FilmedSce
 
 def find_faults(
     frames: Tensor, positions: FloatArray, limits: FaultLimits, scene: FilmedScene, num_conditioning: int
-) -> ClipFaults:
-    """Return the faults of the frames after the first `num_conditioning` of decoded clips, uint8 (N, F, H, W, 3).
+) -> dict[str, Tensor]:
+    """Return by name, float64 (N,), the faults of the frames after the first `num_conditioning` of decoded clips, uint8
+    (N, F, H, W, 3).
+
+    ghost_motion: share of generated steps in which the object moves by more than 2 cm while the tool's point is more
+    than 10 cm (3-D) from the object's centre in both frames. impossible_tool_steps: share of tool steps longer than the
+    limit. object_permanence: 1 where the last frame shows at least the limit of pixels that have the colour which the
+    first frame shows at the object's place. scenery_change: mean absolute change since the first frame, [0, 1], of the
+    still cameras' pixels far from tool and object.
 
     Args:
         positions: what the probe reads in them, (N, F, P), m.
@@ -105,13 +93,13 @@ def find_faults(
         raise ValueError(f"clips are {images.shape[2]} px high, the cameras' pictures {scene.cameras[0][1].height} px")
     away = np.linalg.norm(np.subtract(*scene.places(generated)), axis=-1)
     untouched = np.minimum(away[:, :-1], away[:, 1:]) > GHOST_DISTANCE_M
-    values = (
-        (untouched & (_step_lengths(generated, scene.thing) > GHOST_STEP_M)).mean(1),
-        (_step_lengths(generated, scene.tool) > limits.tool_step_m).mean(1),
-        _object_pixels(images, positions, scene) >= limits.object_px,
-        _scenery_change(images, positions, scene, num_conditioning),
-    )
-    return ClipFaults(*(torch.from_numpy(np.asarray(value, np.float64)) for value in values))
+    values = {
+        "ghost_motion": (untouched & (_step_lengths(generated, scene.thing) > GHOST_STEP_M)).mean(1),
+        "impossible_tool_steps": (_step_lengths(generated, scene.tool) > limits.tool_step_m).mean(1),
+        "object_permanence": _object_pixels(images, positions, scene) >= limits.object_px,
+        "scenery_change": _scenery_change(images, positions, scene, num_conditioning),
+    }
+    return {name: torch.from_numpy(np.asarray(value, np.float64)) for name, value in values.items()}
 
 
 def _step_lengths(positions: FloatArray, which: Sequence[int]) -> FloatArray:
@@ -139,7 +127,7 @@ def _object_pixels(images: UInt8Array, positions: FloatArray, scene: FilmedScene
 def _scenery_change(
     images: UInt8Array, positions: FloatArray, scene: FilmedScene, num_conditioning: int
 ) -> FloatArray:
-    """See ClipFaults.scenery_change, (N,)."""
+    """See find_faults, (N,)."""
     size, changes = images.shape[2], []
     for index, camera in scene.cameras:
         views = images[:, :, :, index * size : (index + 1) * size].astype(np.int16)

@@ -70,8 +70,6 @@ def best_of_n(advantages_N: Tensor, group_ids_N: Tensor, kept_N: Tensor, n: int)
 
     n = 0, or a group that is not larger than n: all stay. Equal advantages are ordered by their index.
     """
-    if n < 0:
-        raise ValueError(f"n must be >= 0, got {n}")
     chosen = kept_N.clone().bool()
     for group in _groups(group_ids_N):
         members = torch.nonzero((group_ids_N == group) & kept_N).flatten()

@@ -13,7 +13,7 @@ micro-batches.
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,9 +30,10 @@ from wm_nodes.training.weights import WeightsError, check_same_layout
 from wm_nodes.video_model.buffer import RolloutBuffer
 from wm_nodes.video_rl.group_advantages import GroupAdvantages, best_of_n, group_advantages
 from wm_nodes.video_rl.nft import NftTerms
-from wm_nodes.video_rl.ratio_and_kl import GrpoTerms, Rows
+from wm_nodes.video_rl.ratio_and_kl import GrpoTerms, Rows, trained_parameters
 
-SUMS = ("objective", "kl", "ratio", "low", "high")
+SUMS = ("objective", "kl", "ratio_mean", "clip_low_share", "clip_high_share")
+"""What an UpdateReport has the means of."""
 MAX_SKIPPED = 5
 """So many buffers in a row whose rewards differ in no group end a training: nothing can be learned from the reward."""
 
@@ -139,7 +140,14 @@ class GrpoLearner:
                 f"all {buffer.rollout.latents.shape[2]} frames of these videos are given: nothing was generated that "
                 f"could be learned from; give fewer"
             )
-        rewards, valid, before = buffer.reward, buffer.valid, self._snapshot()
+        rewards, valid = buffer.reward, buffer.valid
+        # where it is: on a GPU once more the memory of the weights that train and of their two moments; anchor and old
+        # weights are replaced, never changed
+        state, counters = self._state(), self._counters()
+        before = state | {
+            part: {name: tensor.detach().clone() for name, tensor in state[part].items()}
+            for part in ("model", "optimizer")
+        }
         settings = self.settings.advantage
         advantages = group_advantages(rewards, buffer.group_ids, clip=settings.clip, std_scope=settings.std_scope)
         invalid, dropped = int((~valid).sum()), advantages.num_dropped
@@ -158,7 +166,7 @@ class GrpoLearner:
             if updates:
                 self.terms.move_old(self.version)
         except BaseException:
-            self._restore(before)
+            self._set_state(before, counters)
             raise
         self.skipped = skipped
         self.iterations += 1
@@ -214,41 +222,36 @@ class GrpoLearner:
             )
         self._optimizer.step()
         self.version += 1
-        total = len(rows.videos)
-        return UpdateReport(
-            objective=sums["objective"] / total, kl=sums["kl"] / total, ratio_mean=sums["ratio"] / total,
-            clip_low_share=sums["low"] / total, clip_high_share=sums["high"] / total, grad_norm=norm,
-            transitions=total,
-        )
+        means = {name: value / len(rows) for name, value in sums.items()}
+        return UpdateReport(**means, grad_norm=norm, transitions=len(rows))
 
-    def _snapshot(self) -> dict[str, Any]:
-        """Copy what a failed train() puts back, where it is: on a GPU that is once more the memory of the weights that
-        train and of their two moments, and nothing crosses to the host."""
+    def _state(self) -> dict[str, dict[str, Tensor]]:
+        """The tensors that train() depends on, not copied: trained, anchor's and old weights, optimizer."""
         return {
-            "model": self.terms.trained(),
-            "optimizer": {k: v.detach().clone() for k, v in checkpoint.optimizer_tensors(self._optimizer).items()},
-            "old": self.terms.old,  # replaced, never changed
-            "version": self.version,
+            "model": dict(trained_parameters(self.model)), "anchor": self.terms.anchor, "old": self.terms.old,
+            "optimizer": checkpoint.optimizer_tensors(self._optimizer),
         }
 
-    def _restore(self, before: dict[str, Any]) -> None:
-        _set_trained(self.model, before["model"])
-        checkpoint.restore_optimizer(self._optimizer, before["optimizer"])
-        self.terms.old, self.version = before["old"], before["version"]
+    def _counters(self) -> dict[str, int]:
+        return {"version": self.version, "iteration": self.iterations, "skipped": self.skipped}
+
+    @torch.no_grad()
+    def _set_state(self, state: Mapping[str, dict[str, Tensor]], counters: Mapping[str, int]) -> None:
+        for name, parameter in trained_parameters(self.model):
+            parameter.copy_(state["model"][name])
+        checkpoint.restore_optimizer(self._optimizer, state["optimizer"])
+        device = device_of(self.model)
+        self.terms.anchor, self.terms.old = (
+            {name: value.to(device) for name, value in state[part].items()} for part in ("anchor", "old")
+        )
+        self.version, self.iterations, self.skipped = counters["version"], counters["iteration"], counters["skipped"]
 
     # checkpoints
 
     def save(self, path: Path) -> None:
-        """Write everything that train() depends on, atomically: trained, anchor's and old weights, optimizer, counters.
-        """
-        sections = {
-            "model": dict(_trained_parameters(self.model)), "anchor": self.terms.anchor, "old": self.terms.old,
-            "optimizer": checkpoint.optimizer_tensors(self._optimizer),
-        }
-        header = {
-            "version": self.version, "seed": self.seed, "iteration": self.iterations, "skipped": self.skipped
-        }
-        checkpoint.write_checkpoint(path, sections, {"grpo": json.dumps(header)})
+        """Write everything that train() depends on, atomically."""
+        header = {**self._counters(), "seed": self.seed}
+        checkpoint.write_checkpoint(path, self._state(), {"grpo": json.dumps(header)})
 
     def load(self, path: Path) -> None:
         """Continue exactly from save().
@@ -263,19 +266,13 @@ class GrpoLearner:
             raise WeightsError(f"{path} is no complete checkpoint of GRPO ({error}); use a new run folder") from error
         if header["seed"] != self.seed:
             raise ValueError(f"{path} has seed {header['seed']}, this run has {self.seed}; use a new run folder")
-        weights = checkpoint.section(tensors, "model.")
-        check_same_layout(dict(_trained_parameters(self.model)), weights, what=str(path))
-        own = {"anchor.": (self.terms.anchor, "kl.anchor"), "old.": (self.terms.old, "objective")}
-        for prefix, (values, setting) in own.items():
-            if bool(values) != bool(checkpoint.section(tensors, prefix)):
+        now = self._state()
+        state = {part: checkpoint.section(tensors, f"{part}.") for part in now}
+        check_same_layout(now["model"], state["model"], what=str(path))
+        for part, setting in (("anchor", "kl.anchor"), ("old", "objective")):
+            if bool(now[part]) != bool(state[part]):
                 raise ValueError(f"{path} was made with another grpo.{setting}; resume with its settings")
-        _set_trained(self.model, weights)
-        device = device_of(self.model)
-        self.terms.anchor, self.terms.old = (
-            {name: value.to(device) for name, value in checkpoint.section(tensors, prefix).items()} for prefix in own
-        )
-        checkpoint.restore_optimizer(self._optimizer, checkpoint.section(tensors, "optimizer."))
-        self.version, self.iterations, self.skipped = header["version"], header["iteration"], header["skipped"]
+        self._set_state(state, header)
 
 
 def _train_condition(model: nn.Module) -> None:
@@ -288,13 +285,3 @@ def _train_condition(model: nn.Module) -> None:
     model.requires_grad_(False)
     for parameter in condition_parameters():
         parameter.requires_grad_(True)
-
-
-def _trained_parameters(model: nn.Module) -> Iterator[tuple[str, Tensor]]:
-    return ((name, p) for name, p in model.named_parameters() if p.requires_grad)
-
-
-@torch.no_grad()
-def _set_trained(model: nn.Module, values: dict[str, Tensor]) -> None:
-    for name, parameter in _trained_parameters(model):
-        parameter.copy_(values[name])

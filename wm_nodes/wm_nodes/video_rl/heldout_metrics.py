@@ -35,7 +35,7 @@ UNREWARDED = (
 )
 """What no reward can weigh. executed_success, executed_object_cm: of the clip's tool path in the simulator: whether the
 task is done, and how far the object ends from where the clip shows it. reader_success: whether the other reader sees it
-done. The others: see ClipFaults."""
+done. The others: see find_faults."""
 EXECUTED = UNREWARDED[:2]
 SAME_SCENE = 2e-3
 """Most by which a state after a reset may differ from the recorded one, m."""
@@ -139,13 +139,13 @@ def _measure(
 def measure_clips(
     frames: Tensor, positions: FloatArray, references: Clips, by: Yardstick, num_conditioning: int
 ) -> dict[str, Tensor]:
-    """Return by name, float64 (N,), all scores of ClipScores and ClipFaults of decoded clips, uint8 (N, F, H, W, 3),
+    """Return by name, float64 (N,), all scores of ClipScores and find_faults of decoded clips, uint8 (N, F, H, W, 3),
     and where there is a reader `reader_success`: 1 where it sees the task done in the last frame.
 
     positions: what the probe reads in the clips, (N, F, P).
     """
     scores = score_clips(frames, references, by.probe, num_conditioning).named()
-    faults = find_faults(frames, positions, by.limits, by.scene, num_conditioning).named()
+    faults = find_faults(frames, positions, by.limits, by.scene, num_conditioning)
     if by.reader is None:
         return {**scores, **faults}
     read = torch.from_numpy(by.reader.done(frames[:, -1]).astype(np.float64))

@@ -17,8 +17,6 @@ from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
 from wm_nodes.world_model.position_probe import PositionProbe
 
 DRIFT = ("tool_cm", "object_cm", "psnr_db")
-Interval = tuple[float, float, float]
-"""Mean over contexts and its 95 % bootstrap interval."""
 
 
 @dataclass(frozen=True)
@@ -31,16 +29,10 @@ class Headroom:
     """Mean of a clip."""
     best: float
     """Mean of the best of n."""
-    gain: Interval
-    """best - reward."""
-    spread: float
-    """Standard deviation within a group."""
+    gain: tuple[float, float, float]
+    """best - reward, mean over contexts and its 95 % bootstrap interval."""
     codec: float
     """Reward of the recording, decoded from its latents."""
-    object_cm: Interval
-    """How much smaller the error of the clip of best reward is than a clip's; below 0: larger."""
-    tool_cm: Interval
-    """The same."""
 
     @property
     def share(self) -> float:
@@ -66,21 +58,13 @@ def measure_headroom(
     for history in _histories(folder, contexts):
         request = replace(plain, history=history, iteration=history or 0)
         buffer = source.score(request, source.sample(request))
-        single, K = replace(request, group_size=1), buffer.condition.num_conditioning
+        single = replace(request, group_size=1)
         coded = folder.codec.decode(folder.codec.encode(source.references(single).frames))
-        ceiling = mix_rewards(source.scores(single, coded, K), config.rewards)
+        ceiling = mix_rewards(source.scores(single, coded), config.rewards)
         rewards = buffer.rewards["total"].view(-1, n)
-        best = rewards.argmax(1, keepdim=True)
-
-        def gained(values: Tensor, sign: int, best: Tensor = best) -> Interval:
-            values = sign * values.view(-1, n)
-            return bootstrap_mean((values.gather(1, best)[:, 0] - values.mean(1)).numpy(), seed=config.seed)
-
-        found.append(Headroom(
-            (history or 0) + 1, float(rewards.mean()), float(rewards.amax(1).mean()), gained(rewards, 1),
-            float(rewards.std(1, correction=0).mean()), float(ceiling.mean()),
-            gained(buffer.rewards["object_cm"], -1), gained(buffer.rewards["tool_cm"], -1),
-        ))
+        gain = bootstrap_mean((rewards.amax(1) - rewards.mean(1)).numpy(), seed=config.seed)
+        reward, best, codec = (float(values.mean()) for values in (rewards, rewards.amax(1), ceiling))
+        found.append(Headroom((history or 0) + 1, reward, best, gain, codec))
     return found
 
 

@@ -61,7 +61,7 @@ class NftTerms(Anchored):
         x_t = with_conditioning((1 - share) * x_0 + share * noise, condition.frames.float())
         v = self._velocity(self.model, x_t, t, condition)
         with torch.no_grad():
-            old = self._velocity(self._call_old, x_t, t, condition)
+            old = self._velocity(self.at(self.old), x_t, t, condition)
         clean, noisy = (x[:, :, K:].flatten(1) for x in (x_0, x_t))
         nft, clip, share = self.settings.nft, self.settings.advantage.clip, share.flatten(1)
         change = nft.beta * (v - old)  # exactly 0 while the weights have not moved
@@ -84,9 +84,6 @@ class NftTerms(Anchored):
     def _velocity(self, model: Any, x: Tensor, t: Tensor, condition: Condition) -> Tensor:
         v = guided_velocity(model, x, t, condition, self.rollout.cfg).float()
         return v[:, :, condition.num_conditioning :].flatten(1)
-
-    def _call_old(self, *arguments: Any) -> Any:
-        return self.call(self.old, *arguments)
 
     def _draw(self, buffer: RolloutBuffer, rows: Rows, version: int) -> tuple[Tensor, Tensor]:
         """Return times, float64 (M,), and noise (M, C, F, H, W) of the rows, each from its own stream."""

@@ -1,13 +1,19 @@
-"""The two terms of GRPO's loss on stored transitions: the objective of the ratio of likelihoods (DD-14b to DD-16) and
-the KL to an anchor (DD-17, DD-20).
+"""The two terms of GRPO's loss on stored transitions: the objective of the ratio of likelihoods (DD-12, DD-14 to DD-16)
+and the KL to an anchor (DD-17, DD-17a, DD-20).
 
-Shapes: M transitions (video, step) of one network call, U generated elements, S stochastic steps.
+Shapes: M transitions (video, step) of one network call, U generated elements, S stochastic steps. A transition is
+stored as its normalised noise zeta = (x_s - mean) / std, taken after x_s was rounded to its storage type; with std
+cached, both are functions of the stored zeta and of the zeta that the current weights give to the same x_s:
+
+    log p_new - log p_old = mean_u[(zeta_old^2 - zeta_new^2) / 2]      KL = mean_u[(zeta_old - zeta_new)^2 / 2]
+
+so both are exactly 0 while the weights have not moved, and free of the cancellation of two large log-probabilities.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -17,7 +23,41 @@ from torch.func import functional_call
 from wm_nodes.config.video import GrpoConfig, RolloutConfig
 from wm_nodes.core.device import device_of
 from wm_nodes.video_model import GaussianTransition, RolloutBuffer, flow_times, select_steps, transition
-from wm_nodes.video_rl.grpo_math import clip_tails, clipped_objective, log_ratio, log_space_kl, mean_kl
+
+
+def gaussian_logprob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """Return DD-14: the mean over elements of DD-12, log N(x; mean, std^2), per row of (M, U), nats per element."""
+    return (-0.5 * ((x - mean) / std).square() - std.log() - 0.5 * math.log(2 * math.pi)).mean(1)
+
+
+def log_ratio(new_zeta_MU: Tensor, old_zeta_MU: Tensor, weight_MU: Tensor | float = 1.0) -> Tensor:
+    """Return the log of DD-15, (M,): mean over elements of weight (zeta_old - zeta_new)(zeta_old + zeta_new) / 2.
+
+    weight (DD-14c): 1 the full likelihood; 2 std^2 CPS's, which has no 1 / 2 std^2.
+    """
+    return (0.5 * weight_MU * (old_zeta_MU - new_zeta_MU) * (old_zeta_MU + new_zeta_MU)).mean(1)
+
+
+def clipped_objective(log_ratio_M: Tensor, advantages_M: Tensor, clip: float) -> Tensor:
+    """Return DD-16 per transition, to be maximised: min(r A, clamp(r, 1 - clip, 1 + clip) A)."""
+    ratio = log_ratio_M.exp()
+    return torch.minimum(ratio * advantages_M, ratio.clamp(1 - clip, 1 + clip) * advantages_M)
+
+
+def clip_tails(log_ratio_M: Tensor, clip: float) -> tuple[Tensor, Tensor]:
+    """Return how many transitions have a ratio below 1 - clip, and above 1 + clip, float64 ()."""
+    ratio = log_ratio_M.exp()
+    return (ratio < 1 - clip).sum().double(), (ratio > 1 + clip).sum().double()
+
+
+def mean_kl(new_zeta_MU: Tensor, target_zeta_MU: Tensor) -> Tensor:
+    """Return DD-17, (M,): the KL of Gaussians of one std, mean over elements; with the buffer's zeta it is DD-20."""
+    return 0.5 * (target_zeta_MU - new_zeta_MU).square().mean(1)
+
+
+def log_space_kl(log_ratio_M: Tensor) -> Tensor:
+    """Return the k2 estimate (log r)^2 / 2, (M,); DD-17a; far weaker than DD-17."""
+    return 0.5 * log_ratio_M.square()
 
 
 @dataclass(frozen=True)
@@ -91,17 +131,17 @@ class Anchored:
 
     def trained(self) -> dict[str, Tensor]:
         """Copy the model's parameters that train."""
-        return {name: p.detach().clone() for name, p in self.model.named_parameters() if p.requires_grad}
+        return {name: p.detach().clone() for name, p in trained_parameters(self.model)}
 
-    def call(self, weights: dict[str, Tensor], *arguments: Any) -> Any:
-        """Call the model with other weights, while the current ones keep their graph."""
-        return functional_call(self.model, weights, arguments)
+    def at(self, weights: dict[str, Tensor]) -> Callable[..., Any]:
+        """The model with other weights, while the current ones keep their graph."""
+        return lambda *arguments: functional_call(self.model, weights, arguments)
 
     @contextmanager
     def anchored(self) -> Iterator[Callable[..., Any]]:
         """Give the model as it is at the anchor."""
         if self.settings.kl.anchor != "lora_off":
-            yield partial(self.call, self.anchor)
+            yield self.at(self.anchor)
             return
         disable: Any = self.model.disable_adapter
         with disable():
@@ -141,7 +181,9 @@ class GrpoTerms(Anchored):
             kl = kl + self._distance(new, old_zeta)
         due = settings.anchor in ("frozen", "lora_off") or version % settings.dual_every == 0
         if settings.anchor != "buffer" and due:
-            kl = kl + self._distance(new, self._anchor_zeta(buffer, rows))
+            with torch.no_grad(), self.anchored() as model:
+                target = self._transition(model, buffer, rows).zeta
+            kl = kl + self._distance(new, target)
         return kl
 
     # internals
@@ -167,7 +209,6 @@ class GrpoTerms(Anchored):
             return log_space_kl(self._log_ratio(new, target_zeta))
         return mean_kl(new.zeta, target_zeta)
 
-    @torch.no_grad()
-    def _anchor_zeta(self, buffer: RolloutBuffer, rows: Rows) -> Tensor:
-        with self.anchored() as model:
-            return self._transition(model, buffer, rows).zeta
+
+def trained_parameters(model: nn.Module) -> Iterator[tuple[str, Tensor]]:
+    return ((name, p) for name, p in model.named_parameters() if p.requires_grad)

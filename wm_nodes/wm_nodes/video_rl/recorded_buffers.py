@@ -6,7 +6,7 @@ Shapes: N clips of a buffer, F frames, H W 3 image.
 import hashlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +17,6 @@ from torch import Tensor
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.schema import AGENT
 from wm_nodes.config.video import VideoRlConfig
-from wm_nodes.core.device import device_of
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.recording import Bag, BagError, topics
 from wm_nodes.recording.layout import Tiles
@@ -25,10 +24,9 @@ from wm_nodes.recording.messages import stamp_ns
 from wm_nodes.recording.raw import PARTIAL_SUFFIX
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.clips import Clips
-from wm_nodes.video_model.tokenizer_codec import Codec
-from wm_nodes.video_rl.execution_reward import EXECUTION_SCORES, ExecutionReward
-from wm_nodes.video_rl.reference_reward import all_scores, attach_rewards, mix_rewards
-from wm_nodes.world_model.position_probe import PositionProbe
+from wm_nodes.video_rl.execution_reward import EXECUTION_SCORES
+from wm_nodes.video_rl.reference_reward import attach_rewards, mix_rewards
+from wm_nodes.video_rl.sampling import RecordedContexts
 
 
 @dataclass(frozen=True)
@@ -51,8 +49,6 @@ class RecordedClips:
     """By name, float64 (N,), NaN where missing."""
     total: Tensor
     """What trains, float64 (N,), NaN where missing."""
-    valid: Tensor
-    """bool (N,)."""
     picture: UInt8Array | None
     """uint8 (N H, F W, 3), or None where not read."""
     weights: Mapping[str, float] = field(default_factory=dict)
@@ -87,23 +83,16 @@ class Rescored:
     total: Tensor
     """Of now."""
     different: tuple[str, ...]
-    """Names of scores, `total`, `valid` or `verdicts` whose bits are not the recorded ones."""
+    """Names of scores, `total` or `verdicts` whose bits are not the recorded ones."""
     same_reward: bool = True
     """The total was recorded with the same rewards; else it is not compared."""
     verdicts: tuple[Mapping[str, Any], ...] = ()
     """The agent's, where it was called; clips without a recorded verdict are not compared."""
 
 
-@dataclass(frozen=True)
-class JudgedBuffer:
-    """A judge's result for N clips. scores: float64 (N,) by name. verdicts: a row per clip, with its `audit_id`."""
-
-    scores: Mapping[str, Tensor]
-    verdicts: tuple[Mapping[str, Any], ...]
-
-
-BufferJudge = Callable[[RecordedClips, Tensor, Clips], JudgedBuffer]
-"""Judges a buffer's clips, uint8 (N, F, H, W, 3), given the recordings of their contexts."""
+BufferJudge = Callable[[RecordedClips, Tensor, Clips], tuple[Mapping[str, Tensor], tuple[Mapping[str, Any], ...]]]
+"""Judges a buffer's N clips, uint8 (N, F, H, W, 3), given the recordings of their contexts; returns scores, float64
+(N,), by name, and a row per clip with the `audit_id` of its verdict."""
 
 
 def read_run(run_dir: Path, overrides: dict[str, Any] | None = None) -> tuple[Path, VideoRlConfig]:
@@ -171,50 +160,42 @@ def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
                 yield _join_scores(batch, message, picture, _match_audit_ids(verdicts, message))
 
 
-def rescore(
-    recorded: RecordedClips, contexts: Clips, probe: PositionProbe, codec: Codec, rewards: Mapping[str, float],
-    num_conditioning: int, judge: BufferJudge | None = None, first: int = 0,
-    execution: ExecutionReward | None = None,
-) -> Rescored:
+def rescore(recorded: RecordedClips, source: RecordedContexts, judge: BufferJudge | None = None) -> Rescored:
     """Score the pictures against the recordings of their contexts and compare with the recorded scores, bit for bit.
 
     Args:
-        codec: of the video model.
-        rewards: weights of the total; where other scores have a weight than were recorded, the total is not compared.
+        source: its rewards mix the total; where other scores have a weight than were recorded, the total is not
+            compared.
         judge: called where the agent is among the rewards.
-        first: frame of the recordings that the clips begin with.
-        execution: of the same contexts, where it is among the rewards.
 
     Raises:
         BagError: no picture, or scores that cannot be computed from pictures.
         ValueError: a context that the bags do not hold.
     """
-    if int(recorded.contexts.max()) >= len(contexts):
+    if int(recorded.contexts.max()) >= len(source.contexts):
         raise ValueError(
             f"iteration {recorded.iteration} is of context {int(recorded.contexts.max())}, the bags hold "
-            f"{len(contexts)}; name the folder of the run that recorded it"
+            f"{len(source.contexts)}; name the folder of the run that recorded it"
         )
-    references = contexts.select(recorded.contexts).window(first, recorded.num_frames)
-    frames = recorded.frames(*references.frames.shape[2:4]).to(device_of(probe))
-    scores = all_scores(
-        frames, references, probe, codec, num_conditioning, {*recorded.scores, *rewards}, execution
-    )
+    asked_for = source.request(recorded.iteration, recorded.policy_version)
+    request = replace(asked_for, contexts=tuple(recorded.contexts.tolist()), group_size=1)
+    references, rewards = source.references(request), source.config.rewards
+    frames = recorded.frames(*references.frames.shape[2:4]).to(source.folder.device)
+    scores = source.scores(request, frames, recorded.scores)
     asked = {AGENT, *EXECUTION_SCORES}  # given only where they are among the rewards
     unknown, verdicts = sorted(set(recorded.scores) - set(scores) - asked), tuple[Mapping[str, Any], ...]()
     if judge is not None and rewards.get(AGENT):
-        verdict = judge(recorded, frames, references)
-        verdicts = verdict.verdicts
-        scores |= verdict.scores
+        judged, verdicts = judge(recorded, frames, references)
+        scores |= judged
     if unknown:
         raise BagError(f"{', '.join(unknown)} cannot be scored again from pictures; only {', '.join(scores)} can")
     total = mix_rewards(scores, rewards)
-    valid = torch.isfinite(total)
-    total = torch.where(valid, total, torch.nan)
+    total = torch.where(torch.isfinite(total), total, torch.nan)
     weighted, weighted_now = ({n for n, weight in weights.items() if weight} for weights in (recorded.weights, rewards))
     same_reward = weighted == weighted_now
     pairs = {name: (values, scores[name].double()) for name, values in recorded.scores.items() if name in scores}
     if same_reward:
-        pairs |= {"total": (recorded.total, total), "valid": (recorded.valid, valid)}
+        pairs["total"] = recorded.total, total
     ids, answered = recorded.audit_ids, torch.ones(len(total), dtype=torch.bool)
     if verdicts and ids:
         answered = torch.tensor([bool(audit_id) for audit_id in ids])
@@ -293,8 +274,8 @@ def _join_scores(batch: Any, scores: Any, picture: UInt8Array | None, audit_ids:
     contexts = torch.from_numpy(np.array(batch.contexts, np.int64)).repeat_interleave(int(batch.group_size))
     return RecordedClips(
         int(batch.iteration), int(batch.policy_version), contexts, int(batch.num_frames), batch.buffer_uri,
-        batch.sha256, dict(zip(scores.names, values, strict=True)), torch.where(valid, total, torch.nan), valid,
-        picture, dict(zip(scores.names, map(float, scores.weights), strict=True)), audit_ids,
+        batch.sha256, dict(zip(scores.names, values, strict=True)), torch.where(valid, total, torch.nan), picture,
+        dict(zip(scores.names, map(float, scores.weights), strict=True)), audit_ids,
     )
 
 

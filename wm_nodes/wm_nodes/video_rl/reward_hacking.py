@@ -1,53 +1,44 @@
-"""Detects reward hacking (DD-2): the training reward goes up while what it stands for does not."""
+"""Detects reward hacking (DD-2): the training reward goes up while what it stands for does not.
+
+Alarms are numbers of a line of metrics.jsonl: `hacked`, how many metrics did not follow the reward; `reward_slope`, and
+`hacked_<metric>`, the slope of each.
+"""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, ClipScores, more_is_better
+
+SECTION = "heldout"
+"""Of metrics.jsonl: scores by name, mean over the contexts, at the number of buffers trained on."""
+WATCHED = (*ClipScores.__dataclass_fields__, *PICTURE_SCORES)
 T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 """97.5 % quantile of Student's t for 1 to 9 degrees of freedom; the last serves more of them, a little wide."""
 
 
-@dataclass(frozen=True)
-class HackedMetric:
-    """One held-out metric that did not follow the training reward."""
-
-    metric: str
-    """Its name."""
-    proxy_slope: float
-    """The training reward's, per evaluation, over the window."""
-    true_slope: float
-    """The metric's."""
-
-
 def find_hacked_metrics(
     proxy: Sequence[float], held_out: Mapping[str, Sequence[float]], *, window: int
-) -> list[HackedMetric]:
-    """Return the metrics whose least-squares slope is < 0 over the last `window` evaluations while the proxy's is > 0.
+) -> dict[str, float]:
+    """Return by name the least-squares slope of each metric where it is < 0 over the last `window` evaluations while
+    the proxy's is > 0.
 
     Both count only where their 95 % interval (Student's, window - 2 degrees of freedom) leaves out 0: two flat, noisy
     curves raise an alarm in less than one case of a thousand, however short the window.
 
     Args:
         proxy: the training reward at each evaluation. held_out: true metrics at the same ones, more is better.
-
-    Raises:
-        ValueError: fewer than three evaluations in the window, or curves of different lengths.
+        window: at least 3.
     """
-    if window < 3:
-        raise ValueError(f"window must be >= 3 evaluations, got {window}")
-    for name, values in held_out.items():
-        if len(values) != len(proxy):
-            raise ValueError(f"{name} has {len(values)} evaluations, the training reward {len(proxy)}")
     if len(proxy) < window:
-        return []
+        return {}
     widths = T_975[min(window - 2, len(T_975)) - 1]
     rise, rise_error = slope(proxy[-window:])
     if rise <= widths * rise_error:
-        return []
+        return {}
     slopes = {name: slope(values[-window:]) for name, values in held_out.items()}
-    return [HackedMetric(name, rise, trend) for name, (trend, error) in slopes.items() if trend < -widths * error]
+    return {name: trend for name, (trend, error) in slopes.items() if trend < -widths * error}
 
 
 def slope(values: Sequence[float]) -> tuple[float, float]:
@@ -57,3 +48,43 @@ def slope(values: Sequence[float]) -> tuple[float, float]:
     trend = float((x * y).sum() / (x * x).sum())
     residual = y - y.mean() - trend * x
     return trend, float(np.sqrt((residual**2).sum() / max(1, len(y) - 2) / (x * x).sum()))
+
+
+def hacking_alarms(lines: Sequence[Mapping[str, Any]], window: int) -> dict[str, float]:
+    """Return the alarms over the newest `window` evaluations in lines of metrics.jsonl; {} while there are fewer.
+
+    The reward of an evaluation is the mean of the buffers since the one before; slopes are per evaluation, of
+    more_is_better(). Only WATCHED scores are compared.
+    """
+    rewards = {line["step"]: line["reward_mean"] for line in lines if line["section"] == "grpo"}
+    evaluations = {line["step"]: line for line in lines if line["section"] == SECTION}
+    proxy, rows, begin = list[float](), list[Mapping[str, Any]](), 0
+    for step in sorted(evaluations):
+        since = [value for at, value in rewards.items() if begin < at <= step and value is not None]
+        begin = step
+        if since:
+            proxy.append(sum(since) / len(since))
+            rows.append(evaluations[step])
+    if len(proxy) < window:
+        return {}
+    names = [name for name in WATCHED if all(row.get(name) is not None for row in rows)]
+    curves = {name: more_is_better(name, [row[name] for row in rows]).tolist() for name in names}
+    found = find_hacked_metrics(proxy, curves, window=window)
+    alarms = {"reward_slope": slope(proxy[-window:])[0], **{f"hacked_{name}": found[name] for name in found}}
+    return {"hacked": float(len(found)), **(alarms if found else {})}
+
+
+def hacked_slopes(line: Mapping[str, Any]) -> dict[str, float]:
+    """The slopes of the hacked metrics in a line of metrics.jsonl."""
+    return {name: line[f"hacked_{name}"] for name in WATCHED if line.get(f"hacked_{name}") is not None}
+
+
+def alarm_text(line: Mapping[str, Any]) -> str:
+    """One sentence for the alarms in a line of metrics.jsonl; empty where there are none."""
+    if not line.get("hacked"):
+        return ""
+    worse = ", ".join(f"{name} by {-trend:.3g}" for name, trend in hacked_slopes(line).items())
+    return (
+        f"the training reward rises by {line['reward_slope']:.3g} per evaluation while held-out scores get worse: "
+        f"{worse}; weigh them in, or stop earlier"
+    )

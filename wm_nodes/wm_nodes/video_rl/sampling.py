@@ -1,6 +1,6 @@
 """Groups of clips for GRPO: contexts in, a rollout buffer out. Shapes: N clips of a buffer, E of an evaluation."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import torch
@@ -44,26 +44,6 @@ class GroupRequest:
     of whole recordings."""
 
 
-def drawn_history(config: VideoRlConfig, iteration: int) -> int | None:
-    """Return how many clips come before those of an iteration, 0 to groups.history; None where that is 0.
-
-    Without the first clips, which go on from one recorded frame, a model forgets how to make them.
-    """
-    if not config.groups.history:
-        return None
-    return int(numpy_stream(config.seed, "history", iteration).integers(config.groups.history + 1))
-
-
-def recorded_place(config: VideoRlConfig, iteration: int) -> tuple[int, int]:
-    """Return where in the recordings the clips of an iteration begin, and how many of their frames are given."""
-    start, training = config.model.num_conditioning, config.model.training
-    history = drawn_history(config, iteration)
-    if history is None:
-        return 0, start
-    lengths = ClipLengths(training.given_frames, training.new_frames)
-    return lengths.place(start + history * lengths.new)
-
-
 def sample_buffer(
     network: nn.Module, config: VideoRlConfig, condition: Condition, noise: Tensor, seeds: Tensor, groups: Tensor,
     samples: Tensor, iteration: int, policy_version: int,
@@ -84,34 +64,48 @@ def sample_buffer(
     return RolloutBuffer(rollout, condition, groups, samples, {}, policy_version, iteration, config_hash(settings))
 
 
-class ClipGenerator:
-    """Samples clips of recorded contexts (first frames, actions unless groups.hide_actions, instruction) from the video
-    model. With groups.history they are continuations (DD-33): one clip each, from the last frames that the model itself
-    made of a context.
+class RecordedContexts:
+    """Recorded contexts as a source of post-training (train.ClipSource): clips of their first frames, actions (unless
+    groups.hide_actions) and instruction, scored against the recordings. With groups.history they are continuations
+    (DD-33): one clip each, from the last frames that the model itself made of a context.
 
     Args:
         folder: codec and network; the network is used as it is, so loading newer weights into it is enough.
         contexts: the recorded clips to draw contexts from.
+        probe: reads positions off the clips; None: they are sampled and not scored.
 
     Raises:
-        ValueError: groups.history of a model that makes other clips than the settings say, or of recordings that end
-            before.
+        ValueError: groups.history of a model that makes whole episodes, or of recordings that end before; as
+            load_execution_reward.
     """
 
-    def __init__(self, folder: VideoFolder, contexts: Clips, config: VideoRlConfig) -> None:
-        self.folder, self.contexts, self.config = folder, contexts, config
-        if config.groups.history:
-            self._check_lengths()
+    def __init__(
+        self, folder: VideoFolder, contexts: Clips, config: VideoRlConfig, probe: PositionProbe | None = None
+    ) -> None:
+        self.folder, self.contexts, self.config, self._probe = folder, contexts, config, probe
+        clips, frames = config.groups.history, contexts.frames.shape[1]
+        if clips and (wanted := self._made(clips + 1)) > frames:
+            raise ValueError(
+                f"{clips} clips and one more have {wanted} frames, the recordings {frames}; lower groups.history"
+            )
+        self.execution = None if probe is None else load_execution_reward(config, folder, contexts, probe)
+
+    @property
+    def probe(self) -> PositionProbe:
+        """Raises ValueError where there is none."""
+        if self._probe is None:
+            raise ValueError("these contexts have no probe to score clips with; give them one")
+        return self._probe
 
     def request(self, iteration: int, policy_version: int) -> GroupRequest:
         """Draw the contexts of an iteration without replacement from stream `contexts`."""
-        groups = self.config.groups
+        groups, seed, history = self.config.groups, self.config.seed, None
         count = min(groups.contexts, len(self.contexts))
-        drawn = numpy_stream(self.config.seed, "contexts", iteration).choice(len(self.contexts), count, replace=False)
-        return GroupRequest(
-            tuple(int(i) for i in drawn), groups.group_size, iteration, policy_version, groups.shared_noise,
-            drawn_history(self.config, iteration),
-        )
+        drawn = numpy_stream(seed, "contexts", iteration).choice(len(self.contexts), count, replace=False)
+        if groups.history:  # from 0 on: without the first clips a model forgets how to make them
+            history = int(numpy_stream(seed, "history", iteration).integers(groups.history + 1))
+        contexts = tuple(int(i) for i in drawn)
+        return GroupRequest(contexts, groups.group_size, iteration, policy_version, groups.shared_noise, history)
 
     def sample(
         self, request: GroupRequest, on_progress: Callable[[int, int], None] = lambda done, total: None
@@ -151,14 +145,31 @@ class ClipGenerator:
         videos = continue_videos(self.folder.network, *given, lengths, frames, noise, settings)
         return clip_condition(videos, start.actions, start.text, lengths).repeat_interleave(request.group_size)
 
+    def place(self, request: GroupRequest) -> tuple[int, int]:
+        """Return where in the recordings the request's clips begin, and how many of their frames are given."""
+        if request.history is None:
+            return 0, self.folder.clip["num_conditioning"]
+        return self._lengths().place(self._made(request.history))
+
     def references(self, request: GroupRequest) -> Clips:
         """Return the recordings that the request's clips are scored against, one row per clip, of the same frames."""
         recorded = self.contexts.select(torch.tensor(request.contexts).repeat_interleave(request.group_size))
-        if request.history is None:
-            return recorded
-        lengths = self._lengths()
-        first, given = lengths.place(self._made(request.history))
-        return recorded.window(first, given + lengths.new)
+        first, given = self.place(request)
+        return recorded if request.history is None else recorded.window(first, given + self._lengths().new)
+
+    def score(self, request: GroupRequest, clips: RolloutBuffer) -> RolloutBuffer:
+        """Return the buffer with every score of its clips and the training reward `total`, mixed by config.rewards."""
+        scores = self.scores(request, self.folder.codec.decode(clips.rollout.latents))
+        return attach_rewards(clips, scores, mix_rewards(scores, self.config.rewards))
+
+    def scores(self, request: GroupRequest, frames: Tensor, also: Collection[str] = ()) -> dict[str, Tensor]:
+        """Return all_scores of the request's decoded clips, uint8 (N, F, H, W, 3).
+
+        also: scores that are wanted beside the rewards.
+        """
+        wanted, (_, given) = {*self.config.rewards, *also}, self.place(request)
+        codec, references = self.folder.codec, self.references(request)
+        return all_scores(frames, references, self.probe, codec, given, wanted, self.execution)
 
     def _made(self, history: int) -> int:
         """Frames of so many clips, the recorded first ones among them."""
@@ -171,45 +182,6 @@ class ClipGenerator:
                 "train a model of the preset closed_loop"
             )
         return self.folder.lengths
-
-    def _check_lengths(self) -> None:
-        lengths, training, history = self._lengths(), self.config.model.training, self.config.groups.history
-        if (lengths.given, lengths.new) != (training.given_frames, training.new_frames):
-            raise ValueError(
-                f"this video model goes on from {lengths.given} frames with {lengths.new} new ones, the settings say "
-                f"{training.given_frames} and {training.new_frames}; set model.training.given_frames and new_frames"
-            )
-        frames, wanted = self.contexts.frames.shape[1], self._made(history + 1)
-        if wanted > frames:
-            raise ValueError(
-                f"{history} clips and one more have {wanted} frames, the recordings {frames}; lower groups.history"
-            )
-
-
-class RecordedContexts(ClipGenerator):
-    """Recorded contexts as a source of post-training (train.ClipSource): clips are scored against their recordings.
-
-    Args:
-        probe: reads positions off the clips.
-
-    Raises:
-        ValueError: as ClipGenerator, or load_execution_reward.
-    """
-
-    def __init__(self, folder: VideoFolder, contexts: Clips, config: VideoRlConfig, probe: PositionProbe) -> None:
-        super().__init__(folder, contexts, config)
-        self.probe, self.execution = probe, load_execution_reward(config, folder, contexts, probe)
-
-    def score(self, request: GroupRequest, clips: RolloutBuffer) -> RolloutBuffer:
-        """Return the buffer with every score of its clips and the training reward `total`, mixed by config.rewards."""
-        frames = self.folder.codec.decode(clips.rollout.latents)
-        scores = self.scores(request, frames, clips.condition.num_conditioning)
-        return attach_rewards(clips, scores, mix_rewards(scores, self.config.rewards))
-
-    def scores(self, request: GroupRequest, frames: Tensor, num_conditioning: int) -> dict[str, Tensor]:
-        """Return all_scores of the request's decoded clips, uint8 (N, F, H, W, 3)."""
-        references, codec, rewards = self.references(request), self.folder.codec, self.config.rewards
-        return all_scores(frames, references, self.probe, codec, num_conditioning, rewards, self.execution)
 
 
 def sample_by_ode(folder: VideoFolder, contexts: Clips, config: VideoRlConfig, num_steps: int) -> Tensor:

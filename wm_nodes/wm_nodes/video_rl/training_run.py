@@ -19,8 +19,8 @@ from wm_nodes.training.run_folder import TrainingRun, VersionFiles
 from wm_nodes.training.weights import PackedWeights, save_weights
 from wm_nodes.video_model import RolloutBuffer, VideoNetwork
 from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner
-from wm_nodes.video_rl.reward_hacking import HackedMetric
-from wm_nodes.video_rl.validation import SECTION, HeldoutScores, alarm_scalars, find_hacked_now
+from wm_nodes.video_rl.reward_hacking import SECTION, hacking_alarms
+from wm_nodes.video_rl.validation import HeldoutScores
 
 CHECKPOINT = "checkpoints/video_learner.safetensors"
 VIDEO_FILES = VersionFiles("video_policies/video")
@@ -67,8 +67,8 @@ class VideoRun(TrainingRun):
         self.check: Callable[[], None] = lambda: None
         """Called before every call of the network; what it raises ends the training with nothing changed. With several
         ranks it is not called: one that stopped would leave the others waiting."""
-        self.hacked: list[HackedMetric] = []
-        """Metrics that the newest held-out evaluation finds hacked (DD-2)."""
+        self.alarms: dict[str, float] = {}
+        """Of reward hacking, by the newest held-out evaluation (DD-2), see hacking_alarms."""
 
     @property
     def version(self) -> int:
@@ -79,9 +79,7 @@ class VideoRun(TrainingRun):
         """Buffers trained on in the run folder."""
         return self.learner.iterations
 
-    @property
-    def updates(self) -> int:
-        return self.iterations
+    updates = iterations
 
     def train(self, buffer: RolloutBuffer) -> BufferReport:
         """Train on one buffer with rewards, or skip it (see GrpoLearner.train), then save.
@@ -127,9 +125,8 @@ class VideoRun(TrainingRun):
             return
         scores = self._heldout()
         lines = [*read_metrics(self.run_dir), {"section": SECTION, "step": self.iterations, **scores}]
-        alarms = find_hacked_now(lines, self.config.evaluation.window)
-        self.hacked = alarms or []
-        metrics.write(SECTION, self.iterations, {**scores, **alarm_scalars(alarms)})
+        self.alarms = hacking_alarms(lines, self.config.evaluation.window)
+        metrics.write(SECTION, self.iterations, {**scores, **self.alarms})
 
 
 def flatten_metrics(report: BufferReport) -> dict[str, float]:

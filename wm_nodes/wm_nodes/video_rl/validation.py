@@ -1,4 +1,4 @@
-"""Held-out contexts beside the training reward: their scores, one ODE clip each, and the alarm of DD-2.
+"""Held-out contexts beside the training reward: their scores, one ODE clip each.
 
 Shapes: E contexts.
 """
@@ -19,21 +19,10 @@ from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_rl.execution_reward import EXECUTION_SCORES, load_execution_reward
-from wm_nodes.video_rl.reference_reward import (
-    PICTURE_SCORES,
-    ClipScores,
-    all_scores,
-    load_probe,
-    mix_rewards,
-    more_is_better,
-)
-from wm_nodes.video_rl.reward_hacking import HackedMetric, find_hacked_metrics
+from wm_nodes.video_rl.reference_reward import all_scores, load_probe, mix_rewards
 from wm_nodes.video_rl.sampling import sample_by_ode
 from wm_nodes.world_model.position_probe import PositionProbe
 
-SECTION = "heldout"
-"""Of metrics.jsonl: scores by name, mean over the contexts, at the number of buffers trained on."""
-WATCHED = (*ClipScores.__dataclass_fields__, *PICTURE_SCORES)
 OUTCOMES = ("success", "outcome", *EXECUTION_SCORES)
 
 HeldoutScores = Callable[[], Mapping[str, float]]
@@ -99,51 +88,3 @@ def validation_scores(
         return {name: float(value.mean()) for name, value in values.items()}
 
     return scores
-
-
-def find_hacked_now(lines: Sequence[Mapping[str, Any]], window: int) -> list[HackedMetric] | None:
-    """Return the metrics that fell over the newest `window` evaluations in lines of metrics.jsonl while the training
-    reward rose (DD-2), None while there are fewer evaluations. The reward of an evaluation is the mean of the buffers
-    since the one before; slopes are per evaluation, of more_is_better(). Only WATCHED scores are compared.
-    """
-    rewards = {line["step"]: line["reward_mean"] for line in lines if line["section"] == "grpo"}
-    evaluations = {line["step"]: line for line in lines if line["section"] == SECTION}
-    proxy, rows, begin = list[float](), list[Mapping[str, Any]](), 0
-    for step in sorted(evaluations):
-        since = [value for at, value in rewards.items() if begin < at <= step and value is not None]
-        begin = step
-        if since:
-            proxy.append(sum(since) / len(since))
-            rows.append(evaluations[step])
-    if len(proxy) < window:
-        return None
-    names = [name for name in WATCHED if all(row.get(name) is not None for row in rows)]
-    curves = {name: more_is_better(name, [row[name] for row in rows]).tolist() for name in names}
-    return find_hacked_metrics(proxy, curves, window=window)
-
-
-def alarm_scalars(alarms: Sequence[HackedMetric] | None) -> dict[str, float]:
-    """Return for metrics.jsonl the number of alarms, and the slopes of the reward and of each score; {} for None."""
-    if alarms is None:
-        return {}
-    scalars = {"hacked": float(len(alarms))}
-    for alarm in alarms:
-        scalars |= {"reward_slope": alarm.proxy_slope, f"hacked_{alarm.metric}": alarm.true_slope}
-    return scalars
-
-
-def alarms_of(line: Mapping[str, Any]) -> list[HackedMetric]:
-    """Read the alarms in a line of metrics.jsonl."""
-    slopes = {name: line.get(f"hacked_{name}") for name in WATCHED}
-    return [HackedMetric(name, line["reward_slope"], slope) for name, slope in slopes.items() if slope is not None]
-
-
-def alarm_text(alarms: Sequence[HackedMetric]) -> str:
-    """One sentence for the alarms of an evaluation; empty where there are none."""
-    if not alarms:
-        return ""
-    worse = ", ".join(f"{alarm.metric} by {-alarm.true_slope:.3g}" for alarm in alarms)
-    return (
-        f"the training reward rises by {alarms[0].proxy_slope:.3g} per evaluation while held-out scores get worse: "
-        f"{worse}; weigh them in, or stop earlier"
-    )

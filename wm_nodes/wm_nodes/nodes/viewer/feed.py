@@ -45,6 +45,8 @@ TYPES = {topic.name: topic.msgtype for topic in _RECORDED} | {
     VIEW: topics.IMAGES.msgtype, DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
 }
 """Topics that are shown, relative to a namespace, with their message types."""
+PER_STEP = (VIEW, topics.IMAGES.name, topics.TRANSITION.name, topics.CLIPS.name, topics.CLIP_IMAGES.name)
+"""Those of TYPES with pictures, or with a message for every step; nothing of them is missed where nobody looks."""
 
 
 def row_of(topic: str) -> str:

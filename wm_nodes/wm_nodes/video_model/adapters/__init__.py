@@ -11,16 +11,13 @@ published network is all that is missing, beside its text encoder (last hidden s
 """
 
 from wm_nodes.core.imports import MissingPackageError
-from wm_nodes.video_model.adapters.codec import VideoCodec
+from wm_nodes.video_model.adapters.codec import TextEncoder, VideoCodec
 from wm_nodes.video_model.adapters.cosmos import CosmosVelocity
-from wm_nodes.video_model.adapters.folder import ModelFolder
-from wm_nodes.video_model.adapters.loading import LoadSettings, PublicVideoModel, load_public_model
-from wm_nodes.video_model.adapters.lora import add_lora, load_lora, save_lora
-from wm_nodes.video_model.adapters.text import TextEncoder
-from wm_nodes.video_model.adapters.velocity import PublicVelocity
+from wm_nodes.video_model.adapters.loading import PublicVideoModel, load_public_model
+from wm_nodes.video_model.adapters.velocity import PublicVelocity, add_lora, save_lora
 from wm_nodes.video_model.adapters.wan import WanVelocity
 
 __all__ = [
-    "CosmosVelocity", "LoadSettings", "MissingPackageError", "ModelFolder", "PublicVelocity", "PublicVideoModel",
-    "TextEncoder", "VideoCodec", "WanVelocity", "add_lora", "load_lora", "load_public_model", "save_lora",
+    "CosmosVelocity", "MissingPackageError", "PublicVelocity", "PublicVideoModel",
+    "TextEncoder", "VideoCodec", "WanVelocity", "add_lora", "load_public_model", "save_lora",
 ]

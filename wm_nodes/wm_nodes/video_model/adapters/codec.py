@@ -1,7 +1,7 @@
-"""Camera frames to latents and back, through the VAE of a public model.
+"""Camera frames to latents and back, through the VAE of a public model; instructions to the tokens it attends to.
 
 Shapes: B batch, N camera frames, H W camera pixels, C latent channels, h w latent grid, F = 1 + (N - 1) / 4 latent
-frames.
+frames, L tokens, E values.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,15 +22,10 @@ class VideoCodec:
     def __init__(self, vae: Any, *, device: str | torch.device = "cpu", offload: bool = False) -> None:
         self.vae = vae.requires_grad_(False).eval()
         self.device, self.offload = torch.device(device), offload
-        self.frames_per_latent = int(vae.config.scale_factor_temporal)
-        self.pixels_per_cell = int(vae.config.scale_factor_spatial)
-        self.channels = int(vae.config.z_dim)
         self._mean, self._std = (
             torch.tensor(values, device=self.device, dtype=torch.float32).view(1, -1, 1, 1, 1)
             for values in (vae.config.latents_mean, vae.config.latents_std)
         )
-        if not offload:
-            vae.to(self.device)
 
     @torch.no_grad()
     def encode(self, frames: Tensor) -> Tensor:
@@ -42,7 +37,9 @@ class VideoCodec:
         self._check(frames)
 
         def part(some: Tensor) -> Tensor:
-            return self._encode(some.to(self.device).permute(0, 4, 1, 2, 3).float() / 127.5 - 1)
+            pixels = some.to(self.device).permute(0, 4, 1, 2, 3).float() / 127.5 - 1
+            latents: Tensor = self.vae.encode(pixels.to(self.vae.dtype)).latent_dist.mode().float()
+            return (latents - self._mean) / self._std
 
         return self._one_by_one(part, frames)
 
@@ -51,34 +48,16 @@ class VideoCodec:
         """Return uint8 camera frames (B, N, H, W, 3)."""
 
         def part(some: Tensor) -> Tensor:
-            pixels = ((self._decode(some) + 1) * 127.5).round().clamp(0, 255)
-            return pixels.to(torch.uint8).permute(0, 2, 3, 4, 1).contiguous()
+            raw = some.to(self.device, torch.float32) * self._std + self._mean
+            pixels: Tensor = self.vae.decode(raw.to(self.vae.dtype), return_dict=False)[0].float()
+            return ((pixels + 1) * 127.5).round().clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 4, 1).contiguous()
 
         return self._one_by_one(part, latents)
 
     def _one_by_one(self, function: Callable[[Tensor], Tensor], clips: Tensor) -> Tensor:
         """The results of one clip at a time, since the VAE's memory grows with them."""
-        with self._present():
+        with visiting(self.vae, self.device, self.offload):
             return torch.cat([function(clip) for clip in torch.split(clips, 1)])  # type: ignore[no-untyped-call]
-
-    def _encode(self, pixels: Tensor) -> Tensor:
-        latents: Tensor = self.vae.encode(pixels.to(self.vae.dtype)).latent_dist.mode().float()
-        return (latents - self._mean) / self._std
-
-    def _decode(self, latents: Tensor) -> Tensor:
-        raw = latents.to(self.device, torch.float32) * self._std + self._mean
-        pixels: Tensor = self.vae.decode(raw.to(self.vae.dtype), return_dict=False)[0].float()
-        return pixels
-
-    @contextmanager
-    def _present(self) -> Iterator[None]:
-        if self.offload:
-            self.vae.to(self.device)
-        try:
-            yield
-        finally:
-            if self.offload:
-                self.vae.to("cpu")
 
     def _check(self, frames: Tensor) -> None:
         if frames.dtype != torch.uint8 or frames.ndim != 5 or frames.shape[-1] != 3:
@@ -86,8 +65,44 @@ class VideoCodec:
                 f"frames must be uint8 (batch, frames, height, width, 3), got {frames.dtype} {tuple(frames.shape)}"
             )
         _, N, H, W, _ = frames.shape
-        if (N - 1) % self.frames_per_latent or H % self.pixels_per_cell or W % self.pixels_per_cell:
+        each, side = self.vae.config.scale_factor_temporal, self.vae.config.scale_factor_spatial
+        if (N - 1) % each or H % side or W % side:
             raise ValueError(
-                f"this VAE takes 1 + {self.frames_per_latent} n frames of sides that are multiples of "
-                f"{self.pixels_per_cell}, got {N} frames of {H}x{W}"
+                f"this VAE takes 1 + {each} n frames of sides that are multiples of {side}, got {N} frames of {H}x{W}"
             )
+
+
+class TextEncoder:
+    """The way of a diffusers pipeline from prompts to tokens, padded to `max_tokens`, because the models attend to
+    padding.
+
+    Args:
+        pipeline: with tokenizer and text encoder.
+        device: where it computes. offload: the encoder rests on the CPU and visits the device for each call.
+    """
+
+    def __init__(
+        self, pipeline: Any, *, device: str | torch.device = "cpu", offload: bool = False, max_tokens: int = 512
+    ) -> None:
+        pipeline.text_encoder.requires_grad_(False).eval()
+        self.pipeline, self.device, self.offload, self.max_tokens = pipeline, torch.device(device), offload, max_tokens
+
+    @torch.no_grad()
+    def encode(self, prompts: list[str]) -> Tensor:
+        """Return (B, L, E) on the device."""
+        with visiting(self.pipeline.text_encoder, self.device, self.offload):
+            text: Tensor = self.pipeline.encode_prompt(
+                prompts, do_classifier_free_guidance=False, max_sequence_length=self.max_tokens, device=self.device
+            )[0]
+        return text
+
+
+@contextmanager
+def visiting(module: Any, device: torch.device, offload: bool) -> Iterator[None]:
+    """Have a module on a device; offload: it goes back to the CPU afterwards."""
+    module.to(device)
+    try:
+        yield
+    finally:
+        if offload:
+            module.to("cpu")

@@ -1,44 +1,23 @@
-"""From a folder to everything that GRPO needs of a public model."""
+"""From a local folder of the diffusers layout to everything that GRPO needs of a public model: safetensors only, no
+network, no code from the folder."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from wm_nodes.core.device import device_of
-from wm_nodes.core.model_folder import ModelFolderError
-from wm_nodes.video_model.adapters.codec import VideoCodec
+from wm_nodes.core.model_folder import ModelFolderError, read_json
+from wm_nodes.video_model.adapters.codec import TextEncoder, VideoCodec
 from wm_nodes.video_model.adapters.cosmos import CosmosVelocity
-from wm_nodes.video_model.adapters.folder import ModelFolder
-from wm_nodes.video_model.adapters.packages import package
-from wm_nodes.video_model.adapters.text import MAX_TOKENS, TextEncoder
-from wm_nodes.video_model.adapters.velocity import PublicVelocity
+from wm_nodes.video_model.adapters.velocity import PublicVelocity, package
 from wm_nodes.video_model.adapters.wan import WanVelocity
 from wm_nodes.video_model.conditions import Condition
 
-Precision = Literal["float32", "bfloat16", "float16"]
-WAN = ("WanPipeline", "WanImageToVideoPipeline")
-COSMOS = "Cosmos2_5_PredictBasePipeline"
-
-
-@dataclass(frozen=True)
-class LoadSettings:
-    """How a public model is loaded."""
-
-    dtype: Precision = "float32"
-    """Of the weights of network and text encoder; the VAE's are float32, since its pictures suffer from less."""
-    device: str = "cpu"
-    """Where everything computes."""
-    offload: bool = False
-    """VAE and text encoder rest on the CPU and visit the device."""
-    gradient_checkpointing: bool = False
-    """Trade a second forward pass for the activations' memory."""
-    max_tokens: int = MAX_TOKENS
-    """Of an embedded prompt."""
-    negative_prompt: str = ""
-    """What the unconditional branch sees."""
+WAN, COSMOS = ("WanPipeline", "WanImageToVideoPipeline"), "Cosmos2_5_PredictBasePipeline"
+REMEDY = "download the whole model again in its diffusers layout (with safetensors), and name that folder"
 
 
 @dataclass(frozen=True)
@@ -71,54 +50,75 @@ class PublicVideoModel:
         return Condition(self.codec.encode(frames), actions, text).to(device)
 
 
-def load_public_model(folder: Path | str, settings: LoadSettings | None = None) -> PublicVideoModel:
-    """Load a Wan or Cosmos-Predict2.5 folder; nothing is fetched and nothing in it is executed.
+def load_public_model(
+    folder: Path | str, *, dtype: str = "float32", device: str = "cpu", offload: bool = False,
+    gradient_checkpointing: bool = False, max_tokens: int = 512, negative_prompt: str = "",
+) -> PublicVideoModel:
+    """Load a Wan or Cosmos-Predict2.5 folder.
+
+    Args:
+        dtype: of the weights of network and text encoder; the VAE's are float32, since its pictures suffer from less.
+        device: where everything computes. offload: VAE and text encoder rest on the CPU and visit it.
+        gradient_checkpointing: trade a second forward pass for the activations' memory.
+        max_tokens: of an embedded prompt. negative_prompt: what the unconditional branch sees.
 
     Raises:
         ModelFolderError: the folder is missing, incomplete or of another kind; names the path and the remedy.
         MissingPackageError: a package of requirements/video.txt is not installed.
     """
-    settings = settings or LoadSettings()
-    package("diffusers"), package("transformers")
-    files = ModelFolder(folder)
-    if files.pipeline not in (*WAN, COSMOS):
-        raise ModelFolderError(f"{files.folder} holds a {files.pipeline}; supported are {', '.join((*WAN, COSMOS))}")
-    if files.has("transformer_2"):
+    diffusers, transformers, _ = map(package, ("diffusers", "transformers", "ftfy"))
+    folder = Path(folder)
+    index = read_json(folder / "model_index.json", REMEDY)
+    scheduler = read_json(folder / "scheduler" / "scheduler_config.json", REMEDY)
+    kind = index.get("_class_name")
+    if kind not in (*WAN, COSMOS):
+        raise ModelFolderError(f"{folder} holds a {kind}; supported are {', '.join((*WAN, COSMOS))}")
+    if index.get("transformer_2", [None])[-1] is not None:
         raise ModelFolderError(
-            f"{files.folder} holds two experts (Wan 2.2 A14B), which are not supported; take Wan 2.1 or Wan 2.2 TI2V-5B"
+            f"{folder} holds two experts (Wan 2.2 A14B), which are not supported; take Wan 2.1 or Wan 2.2 TI2V-5B"
         )
-    dtype = getattr(torch, settings.dtype)
-    vae = files.model("vae", "AutoencoderKLWan", torch.float32)
-    codec = VideoCodec(vae, device=settings.device, offload=settings.offload)
-    text = TextEncoder(
-        files.text_encoder(dtype), files.tokenizer(), "cosmos2.5" if files.pipeline == COSMOS else "wan",
-        device=settings.device, offload=settings.offload, max_tokens=settings.max_tokens,
+    encoder, network = transformers.UMT5EncoderModel, diffusers.WanTransformer3DModel
+    if kind == COSMOS:
+        encoder, network = transformers.Qwen2_5_VLForConditionalGeneration, diffusers.CosmosTransformer3DModel
+    weights = getattr(torch, dtype)
+    vae = _load(diffusers.AutoencoderKLWan, folder / "vae", torch.float32)
+    pipeline = getattr(diffusers, kind)(
+        tokenizer=_read(transformers.AutoTokenizer, folder / "tokenizer", trust_remote_code=False),
+        text_encoder=_load(encoder, folder / "text_encoder", weights), vae=vae, scheduler=None, transformer=None,
+        **({"safety_checker": nn.Identity()} if kind == COSMOS else {}),
     )
-    null_text = text.encode([settings.negative_prompt])[0]
-    scheduler = files.scheduler()
+    text = TextEncoder(pipeline, device=device, offload=offload, max_tokens=max_tokens)
+    transformer, null_text = _load(network, folder / "transformer", weights), text.encode([negative_prompt])[0]
     try:
-        velocity: PublicVelocity
-        if files.pipeline == COSMOS:
-            velocity = CosmosVelocity(files.model("transformer", "CosmosTransformer3DModel", dtype), null_text)
-        else:
-            velocity = WanVelocity(
-                files.model("transformer", "WanTransformer3DModel", dtype), null_text,
-                fused=bool(files.index.get("expand_timesteps")),
-                time_scale=float(scheduler.get("num_train_timesteps", 1000)),
-            )
-    except ModelFolderError:
-        raise
+        velocity = CosmosVelocity(transformer, null_text) if kind == COSMOS else WanVelocity(
+            transformer, null_text, fused=bool(index.get("expand_timesteps")),
+            time_scale=float(scheduler.get("num_train_timesteps", 1000)),
+        )
     except ValueError as error:
-        raise ModelFolderError(f"{files.folder / 'transformer'}: {error}") from error
-    velocity.to(settings.device)
-    if settings.gradient_checkpointing:
-        velocity.enable_gradient_checkpointing()
-    return PublicVideoModel(velocity, codec, text, _shift(scheduler))
+        raise ModelFolderError(f"{folder / 'transformer'}: {error}") from error
+    if gradient_checkpointing:
+        transformer.enable_gradient_checkpointing()
+    # Wan's schedulers state the shift; Cosmos's sigmas are Karras's, for which we take 5
+    shift = 5.0 if scheduler.get("use_karras_sigmas") else scheduler.get("flow_shift", scheduler.get("shift", 1.0))
+    codec = VideoCodec(vae, device=device, offload=offload)
+    return PublicVideoModel(velocity.to(device), codec, text, float(shift))
 
 
-def _shift(scheduler: dict[str, Any]) -> float:
-    """Wan's schedulers state it; Cosmos's sigmas are Karras's, for which we take 5."""
-    if scheduler.get("use_karras_sigmas"):
-        return 5.0
-    shift: float = scheduler.get("flow_shift", scheduler.get("shift", 1.0))
-    return float(shift)
+def _load(kind: Any, path: Path, dtype: torch.dtype) -> Any:
+    """A part with every weight from its folder, in evaluation mode."""
+    model, report = _read(kind, path, torch_dtype=dtype, use_safetensors=True, output_loading_info=True)
+    absent = sorted(str(name) for name in report["missing_keys"])
+    if absent:
+        raise ModelFolderError(
+            f"{path} lacks {len(absent)} weights of its {kind.__name__}, the first {absent[0]}; {REMEDY}"
+        )
+    return model.eval()
+
+
+def _read(kind: Any, path: Path, **options: Any) -> Any:
+    try:
+        return kind.from_pretrained(str(path), local_files_only=True, **options)
+    except Exception as error:  # torch, safetensors and both libraries raise kinds of their own
+        raise ModelFolderError(
+            f"{path} cannot be loaded as {kind.__name__} ({type(error).__name__}: {error}); {REMEDY}"
+        ) from error

@@ -9,11 +9,10 @@ Schedulers that round the time they tell to an integer (UniPC in diffusers) diff
 
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from wm_nodes.video_model.adapters.velocity import PublicVelocity
-from wm_nodes.video_model.conditions import Condition
-from wm_nodes.video_model.kernels import with_conditioning
 
 
 class WanVelocity(PublicVelocity):
@@ -32,33 +31,22 @@ class WanVelocity(PublicVelocity):
         self, transformer: nn.Module, null_text: Tensor | None = None, *, fused: bool = False,
         time_scale: float = 1000.0,
     ) -> None:
-        config: Any = transformer.config
-        super().__init__(transformer, null_text)
+        super().__init__(transformer, null_text, "" if fused else "makes video from text alone", clean_time=0.0)
         self.fused, self.time_scale = fused, time_scale
-        self.patch: tuple[int, int, int] = tuple(config.patch_size)
-        self.channels = int(config.out_channels)
+        config = self.transformer.config
         if getattr(config, "image_dim", None) is not None or config.in_channels != config.out_channels:
             raise ValueError(
                 "this Wan model also wants CLIP embeddings or further channels of the first frame (I2V), which are not "
                 "supported; take Wan 2.2 TI2V-5B"
             )
 
-    def forward(self, x: Tensor, t: Tensor, condition: Condition, drop: Tensor | None = None) -> Tensor:
-        """See VelocityModel; the result is float32.
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.transformer.patch_embedding.weight.dtype  # type: ignore[no-any-return]
 
-        Raises:
-            ValueError: given frames, text or latents that this model does not take.
-        """
-        self._check_grid(x, self.patch, self.channels)
-        K, dtype = condition.num_conditioning, self.transformer.patch_embedding.weight.dtype
-        if K and not self.fused:
-            raise ValueError(f"this Wan model makes video from text alone and takes no given frames, got {K}")
-        times = self._frame_times(t, x, K, clean=0.0)
+    def call(self, x: Tensor, times_BF: Tensor, text: Tensor, num_conditioning: int) -> Any:
         tokens = (x.shape[3] // self.patch[1]) * (x.shape[4] // self.patch[2])  # of a latent frame
-        told = times.repeat_interleave(tokens, 1) if self.fused else times[:, 0]
-        out = self.transformer(
-            hidden_states=with_conditioning(x, condition.frames).to(dtype), timestep=(told * self.time_scale).float(),
-            encoder_hidden_states=self._text(condition, drop, dtype), return_dict=False,
-        )[0]
-        velocity: Tensor = out.float()
-        return velocity
+        times = times_BF.repeat_interleave(tokens, 1) if self.fused else times_BF[:, 0]
+        return self.transformer(
+            hidden_states=x, timestep=(times * self.time_scale).float(), encoder_hidden_states=text, return_dict=False
+        )

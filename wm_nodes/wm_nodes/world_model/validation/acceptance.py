@@ -22,7 +22,7 @@ from wm_nodes.world_model import WorldModels
 from wm_nodes.world_model.positions import judged_things
 from wm_nodes.world_model.validation.acceptance_report import AcceptanceReport, Criterion, Outcome, at_step, number_of
 from wm_nodes.world_model.validation.goals import goal_metrics
-from wm_nodes.world_model.validation.open_loop import MOVED_M, evaluate_rollouts
+from wm_nodes.world_model.validation.open_loop import MOVED_M, evaluate_rollouts, imagine_episodes
 from wm_nodes.world_model.validation.pictures import (
     ENOUGH,
     horizons_of,
@@ -58,9 +58,9 @@ class CloneRollouts:
 def model_metrics(models: WorldModels, heldout: EpisodeArrays, config: RunConfig) -> dict[str, float]:
     """Return the metrics of rollouts of held-out actions against the recordings; see open_loop.evaluate_rollouts, and
     pictures.picture_metrics where no positions are known."""
-    threshold = config.reward.success_threshold
-    metrics = evaluate_rollouts(models.tokenizer, models.action, heldout, threshold=threshold, probe=models.probe)
-    return metrics if _has_positions(metrics) else metrics | picture_metrics(models, heldout)
+    threshold, imagined = config.reward.success_threshold, imagine_episodes(models.tokenizer, models.action, heldout)
+    metrics = evaluate_rollouts(models.tokenizer, imagined, heldout, threshold=threshold, probe=models.probe)
+    return metrics if _has_positions(metrics) else metrics | picture_metrics(models, imagined, heldout)
 
 
 def accept_world_model(

@@ -97,10 +97,10 @@ def position_reader(tokenizer: Tokenizer, probe: PositionProbe | None) -> Callab
 
 @torch.inference_mode()
 def evaluate_rollouts(
-    tokenizer: Tokenizer, model: ActionModel | TokenActionModel, episodes: EpisodeArrays, *, threshold: float = 0.7,
+    tokenizer: Tokenizer, imagined: ImaginedEpisodes, episodes: EpisodeArrays, *, threshold: float = 0.7,
     probe: PositionProbe | None = None,
 ) -> dict[str, float]:
-    """Metrics by name (see docs/metrics.md); positions in cm, PSNR in dB, `_hNN` at step NN.
+    """Metrics by name of the episodes' rollouts (see docs/metrics.md); positions in cm, PSNR in dB, `_hNN` at step NN.
 
     object_/tool_: mean error of `rollout`, of the probe on real frames (`floor`), of the tokenizer's probe on their
     `latents`, of the first frame (`copy`), and rollout / copy (`ratio`, with its bootstrap interval `ratio_low` to
@@ -110,7 +110,6 @@ def evaluate_rollouts(
     Without ground truth, where the tasks' files name no positions, or where the model reads none, there is no object_
     and tool_ and no moved_share.
     """
-    imagined = imagine_episodes(tokenizer, model, episodes)
     truth = episode_targets(episodes)
     metrics: dict[str, float] = {"episodes": float(len(episodes))}
     thing, tool = (columns_of(episodes.tasks[0], name) for name in ("object", "tool"))

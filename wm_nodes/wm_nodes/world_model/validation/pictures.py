@@ -22,7 +22,7 @@ from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.validation.acceptance_report import at_step
 from wm_nodes.world_model.validation.controllability import under_actions
-from wm_nodes.world_model.validation.open_loop import BATCH, HORIZONS, imagine_episodes
+from wm_nodes.world_model.validation.open_loop import BATCH, HORIZONS, ImaginedEpisodes, imagine_episodes
 
 VARIES = 0.04
 """A pixel varies between episodes whose standard deviation, of [0, 1], is above this: less may be noise."""
@@ -35,8 +35,8 @@ SAME_ACTION = 1e-3
 
 
 @torch.inference_mode()
-def picture_metrics(models: WorldModels, episodes: EpisodeArrays) -> dict[str, float]:
-    """Metrics by name, `_hNN` at step NN, of the `feature_episodes` that are at least that long.
+def picture_metrics(models: WorldModels, imagined: ImaginedEpisodes, episodes: EpisodeArrays) -> dict[str, float]:
+    """Metrics by name of the episodes' rollouts, `_hNN` at step NN, of the `feature_episodes` that are so long.
 
     feature_ratio: distance of the rollout to the recording over that of the first frame: 1 is as good as copying it.
     feature_floor: the same of recorded frames that are encoded and decoded, which a rollout can hardly undercut.
@@ -45,7 +45,6 @@ def picture_metrics(models: WorldModels, episodes: EpisodeArrays) -> dict[str, f
     varying_error: see there, of encoded and decoded frames, at these steps and of the first ones (h00).
     """
     tokenizer, others = models.tokenizer, np.roll(episodes.actions, 1, axis=0)
-    rollouts = imagine_episodes(tokenizer, models.action, episodes).frames
     misled = imagine_episodes(tokenizer, models.action, under_actions(episodes, others, models.spec)).frames
     differ = np.abs(episodes.actions - others).mean(2)
     first = episodes.images[:, 0]
@@ -59,7 +58,7 @@ def picture_metrics(models: WorldModels, episodes: EpisodeArrays) -> dict[str, f
         reconstructed = _in_batches(tokenizer.decode, real).cpu().numpy()
         rolled, copied, floor = (
             _distances(tokenizer, frames, real)
-            for frames in (rollouts[rows, horizon - 1], episodes.images[rows, 0], reconstructed)
+            for frames in (imagined.frames[rows, horizon - 1], episodes.images[rows, 0], reconstructed)
         )
         both = (np.roll(episodes.lengths, 1)[rows] >= horizon) & (differ[rows, :horizon].mean(1) > SAME_ACTION)
         misled_by = rolled[:0]
