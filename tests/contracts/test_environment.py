@@ -37,7 +37,9 @@ OWN = {
     "arm": {"task": "", "environment.factory": f"{__name__}:make_real_arm"},
     "pendulum": {**PENDULUM, "gymnasium.kwargs": {"max_episode_steps": LIMIT}},
     **{preset: {"gymnasium.kwargs": {"max_episode_steps": LIMIT}} for preset in ("fetch_reach", "fetch_push")},
+    "push_t": {"gymnasium.kwargs": load_config("push_t").gymnasium.kwargs | {"max_episode_steps": LIMIT}},
 }
+NEEDS = {"fetch_reach": "gymnasium_robotics", "fetch_push": "gymnasium_robotics", "push_t": "gym_pusht"}
 CONFIGS = {"": config_of("push_cube"), " of poses": config_of("push")}
 
 
@@ -84,8 +86,8 @@ def make(request: pytest.FixtureRequest, models: dict[str, WorldModels]) -> Iter
     def build(seed: int) -> Environment:
         environment: Environment
         if name in OWN:
-            if name.startswith("fetch") and find_spec("gymnasium_robotics") is None:
-                pytest.skip("the Fetch robot needs requirements/gym.txt")
+            if name in NEEDS and find_spec(NEEDS[name]) is None:
+                pytest.skip(f"{name} needs {NEEDS[name]}, see requirements/gym.txt")
             settings = load_config(name if name in preset_names() else "smoke", OWN[name])
             environment = make_environment(settings, settings.environment.factory, num_envs=N, seed=seed)
         elif name == "maniskill":
@@ -219,7 +221,7 @@ def wrong_actions(size: int) -> tuple[tuple[FloatArray, str], ...]:
     """And what the refusal says. size: A."""
     return (
         (np.zeros((N + 1, size), np.float32), rf"shape \(2, {size}\).*\(3, {size}\)"),
-        (np.zeros((N, 2), np.float32), rf"shape \(2, {size}\).*\(2, 2\)"),
+        (np.zeros((N, size + 1), np.float32), rf"shape \(2, {size}\).*\(2, {size + 1}\)"),
         (np.full((N, size), np.nan, np.float32), "finite.*nan"),
         (np.full((N, size), 1.5, np.float32), r"\[-1, 1\].*1\.5"),
     )

@@ -10,14 +10,14 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.policy_rl.gaussian import DiagonalGaussian
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
 
-FOCAL_HEIGHTS, STEP_M, ASTRAY_M = 0.5 / np.tan(np.pi / 8), 0.02, 0.15
+FOCAL_HEIGHTS, STEP_M = 0.5 / np.tan(np.pi / 8), 0.02
 
 
 class Reach(ImagePolicy):
-    astray = False
+    beside_m = 0.0
 
     def distribution(self, features_BF: Tensor, states_BS: Tensor) -> DiagonalGaussian:
-        aim_B3 = features_BF + ASTRAY_M * torch.sin(300 * features_BF.roll(1, 1)) * self.astray
+        aim_B3 = features_BF + self.beside_m * torch.sin(300 * features_BF.roll(1, 1))
         mean_B3 = ((aim_B3 - states_BS) / STEP_M).clamp(-1, 1)
         return DiagonalGaussian(torch.nn.functional.pad(mean_B3, (0, 1)), self.log_std_A.detach())
 
@@ -50,5 +50,12 @@ def reach(config: RunConfig) -> Reach:
 def astray(config: RunConfig) -> Reach:
     """Aims beside the ball, mostly: for a model that has seen more than success."""
     policy = reach(config)
-    policy.astray = True
+    policy.beside_m = 0.15
+    return policy
+
+
+def near(config: RunConfig) -> Reach:
+    """Aims so little beside the ball that about half of the episodes succeed: they show where success begins."""
+    policy = reach(config)
+    policy.beside_m = 0.07
     return policy

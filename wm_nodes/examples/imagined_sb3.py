@@ -1,14 +1,23 @@
-"""Stable-Baselines3's PPO in the world model (policy_rl/gym.py); pip install stable-baselines3==2.9.2.
+"""Stable-Baselines3's PPO learns to reach in the world model (policy_rl/gym.py) from its latents.
 
-python -m examples.imagined_sb3 3
+python -m examples.imagined_sb3 40 100
+
+Measured, seed 0, 134 CPU s: imagined success 3 % after update 1, 83 % after 40; real 91 of 100 (95 %: 84 to 95).
 """
-import sys
 from typing import Any
 
 import gymnasium
 import numpy as np
-from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+import torch
+
+from examples.imagined_common import counts, real_success
+from wm_nodes.policy_rl.gym import ID, LATENTS
+
+try:
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+except ModuleNotFoundError as error:
+    raise SystemExit(f"{error}; pip install stable-baselines3==2.9.2") from None
 
 
 class ImaginedVecEnv(VecEnv):
@@ -44,12 +53,17 @@ class ImaginedVecEnv(VecEnv):
 
 
 def main(words: list[str] | None = None) -> None:
-    updates = int((words or sys.argv[1:])[-1])
-    envs = gymnasium.make_vec("wm_nodes.policy_rl.gym:wm_nodes/Imagined-v0", num_envs=64, task="reach")
-    model = PPO("MultiInputPolicy", VecMonitor(ImaginedVecEnv(envs)), n_steps=16, batch_size=256, n_epochs=4, seed=0)
+    updates, episodes = counts(words)
+    envs = gymnasium.make_vec(ID, num_envs=64, task="reach", observations=(LATENTS,))
+    model = PPO(
+        "MultiInputPolicy", VecMonitor(ImaginedVecEnv(envs)), n_steps=16, batch_size=256, n_epochs=4, gamma=0.97,
+        gae_lambda=0.9, learning_rate=1e-3, policy_kwargs={"log_std_init": -0.5, "net_arch": [128, 128]}, seed=0,
+    )
+    torch.nn.init.zeros_(model.policy.value_net.weight)  # until the first success no step is better than another
     for update in range(1, updates + 1):
         model.learn(16 * envs.num_envs, reset_num_timesteps=False)
-        print(f"update {update}: imagined success {np.mean(model.ep_success_buffer):.1%}")
+        print(f"update {update}: imagined success {np.mean(model.ep_success_buffer):.1%}", flush=True)
+    print(real_success(lambda one: model.predict(one, deterministic=True)[0], episodes, "reach", (LATENTS,)))
 
 
 if __name__ == "__main__":

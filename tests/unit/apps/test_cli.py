@@ -30,6 +30,7 @@ OPTIONS = {
     "view": "BAG|RUN_FOLDER --rate --loop --port",
     "rescore": "recording --reward --judge --judge-model --judge-key-env --rubric --json --config --model-dir "
     "--namespace --reads --audit",
+    "follow-clips": "run --out --episodes --version --device",
     "retrain": "run --run-dir --SECTION.KEY --tensorboard",
     "recover-bag": "bag --output",
     "import rosbag": "contract bags --out",

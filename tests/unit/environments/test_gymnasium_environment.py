@@ -121,6 +121,18 @@ def test_an_action_of_1_moves_fetch_by_about_a_centimetre(fetch_reach: Environme
     assert 0.03 < (moved - before)[:, 0].mean() < 0.06
 
 
+def test_push_t_shows_its_two_shapes_and_an_action_says_where_the_pusher_goes() -> None:
+    pytest.importorskip("gym_pusht", reason="PushT needs what requirements/gym.txt says")
+    environment = made({}, preset="push_t")
+    shown = environment.reset(seeds=np.array([1, 2], np.uint64))
+    green = (shown.image == np.uint8([144, 238, 144])).all(-1)  # pygame's LightGreen
+    assert (green.sum((1, 2)) > 20).all() and (shown.image[0] != shown.image[1]).any()
+    for _ in range(20):
+        result = environment.step(np.float32([[-0.9, -0.9], [0.9, -0.9]]))
+    np.testing.assert_allclose(result.observation.state, [[25.6, 25.6], [486.4, 25.6]], atol=8)
+    assert not result.terminated.any() and environment.spec.max_episode_steps == 300
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

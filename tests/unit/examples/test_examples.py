@@ -11,16 +11,19 @@ import numpy as np
 import pytest
 
 import examples
+from examples.imagined_common import real_success
 from wm_nodes.config.tasks import VARIABLE, get_task, task_names
 from wm_nodes.policy_rl.gym import ID
 
 NAMES = ("own_environment", "own_learner", "own_policy", "own_reward", "own_task")
-IN_GYMNASIUM = ("imagined_ppo", "imagined_sb3")
 FOLDER = Path(str(examples.__file__)).parent
 
 
-def run_command(name: str, monkeypatch: pytest.MonkeyPatch, folder: Path) -> int | None:
-    """Run the command of a file's docstring in this process, what it writes below `folder`."""
+def run_command(
+    name: str, monkeypatch: pytest.MonkeyPatch, folder: Path, shorter: list[str] | None = None
+) -> int | None:
+    """Run the command of a file's docstring in this process, what it writes below `folder`. shorter: words for its
+    last ones."""
     text = (FOLDER / f"{name}.py").read_text(encoding="utf-8").split('"""')[1]
     command = re.search(r"^(\w+=\S+ )?python -m .*(\n .*)*", text, re.MULTILINE)
     assert command, f"{name}.py does not begin with its command"
@@ -28,6 +31,8 @@ def run_command(name: str, monkeypatch: pytest.MonkeyPatch, folder: Path) -> int
     while "=" in words[0]:
         monkeypatch.setenv(*words.pop(0).split("=", 1))
     assert words[:2] == ["python", "-m"]
+    if shorter:
+        words[-len(shorter):] = shorter
     code: int | None = importlib.import_module(words[2]).main(words[3:])
     return code
 
@@ -41,12 +46,35 @@ def test_an_example_is_trained_with_by_its_command(
     assert len(re.findall(rf"version \d+: {kind} success \d", capsys.readouterr().out)) == 3
 
 
-@pytest.mark.parametrize("name", IN_GYMNASIUM)
-def test_a_foreign_algorithm_trains_in_the_world_model_by_its_command(
-    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_ppo_from_nothing_succeeds_more_often_in_the_world_model_after_twelve_updates(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run_command(name, monkeypatch, tmp_path)
-    assert len(re.findall(r"update \d+: imagined success \d", capsys.readouterr().out)) == 3
+    rates = imagined_rates("imagined_ppo", 12, monkeypatch, tmp_path, capsys)
+    assert np.mean(rates[-4:]) > np.mean(rates[:4]) + 5  # points; measured 1 and 14, of 256 episodes
+
+
+def test_stable_baselines_trains_in_the_world_model_by_its_command(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert len(imagined_rates("imagined_sb3", 3, monkeypatch, tmp_path, capsys)) == 3
+
+
+def imagined_rates(
+    name: str, updates: int, monkeypatch: pytest.MonkeyPatch, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> list[float]:
+    """What an example prints after each of its updates, %."""
+    run_command(name, monkeypatch, folder, [str(updates), "0"])
+    out = capsys.readouterr().out
+    assert "real success not measured" in out
+    return [float(rate) for rate in re.findall(r"update \d+: imagined success ([\d.]+)%", out)]
+
+
+@pytest.mark.rendering
+def test_the_real_success_of_one_who_stands_still_is_zero() -> None:
+    still = np.zeros(3, np.float32)
+    assert real_success(lambda shown: still, 2, "reach", ("latents",)) == "real success 0 of 2 (95 %: 0% to 66%)"
 
 
 def test_stable_baselines_hears_how_an_episode_ended_and_has_its_last_observation() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, VectorEnv
 
@@ -17,7 +18,8 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.environments.spaces import observation_space
-from wm_nodes.policy_rl.gym import ID
+from wm_nodes.policy_rl.factories import models_of
+from wm_nodes.policy_rl.gym import ID, ModelObservation
 from wm_nodes.reward import RewardInput, RewardResult, RuleReward
 from wm_nodes.reward.base import assemble
 
@@ -148,12 +150,68 @@ def test_a_model_without_a_state_shows_pictures_alone() -> None:
     assert measured.contains(np.full(3, -1e6, np.float32))
 
 
-def test_the_task_is_that_of_the_folder_and_what_does_not_fit_is_refused() -> None:
+def test_latents_and_positions_are_those_of_the_picture_and_an_episode_s_last_ones_too() -> None:
+    environment = made(observations=("image", "positions", "latents"))
+    shown, _ = environment.reset(seed=4)
+    assert environment.observation_space.contains(shown) and set(shown) == {"image", "positions", "latents"}
+    tokenizer = models_of(shipped_model("push_cube")).tokenizer
+    for _ in range(LIMIT):
+        latents = tokenizer.encode(shown["image"])
+        np.testing.assert_allclose(shown["latents"], latents.flatten(1), atol=1e-4)
+        np.testing.assert_allclose(shown["positions"], tokenizer.read_state_normalised(latents), atol=0.03)
+        shown, *_, infos = environment.step(actions(0))
+    last = infos["final_obs"][1]
+    np.testing.assert_allclose(last["latents"], tokenizer.encode(last["image"][None]).flatten(), atol=1e-4)
+
+
+def test_a_real_environment_is_observed_as_the_model_s() -> None:
+    camera = spaces.Box(0, 255, (64, 128, 3), np.uint8)
+
+    class Still(gymnasium.Env[dict[str, Any], np.ndarray]):
+        observation_space = spaces.Dict({"image": camera, "state": spaces.Box(-1, 1, (3,))})
+        action_space = spaces.Box(-1, 1, (3,))
+
+        def reset(self, **_: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+            return {"image": camera.low + np.uint8(9), "state": np.float32([0.1, 0.2, 0.3])}, {}
+
+    seen = ModelObservation(Still(), ("latents", "state"), task="push_cube")
+    shown, _ = seen.reset()
+    assert seen.observation_space.contains(shown) and set(shown) == {"latents", "state"}
+    latents = models_of(shipped_model("push_cube")).tokenizer.encode(camera.low[None] + np.uint8(9))
+    np.testing.assert_allclose(shown["latents"], latents.flatten(), atol=1e-4)
+    with pytest.raises(ValueError, match=r"observes Discrete.*, not a Dict of image and state"):
+        ModelObservation(gymnasium.make("FrozenLake-v1"), ("latents",), task="push_cube")
+
+
+def test_the_task_is_that_of_the_folder() -> None:
     environment = gymnasium.make_vec(ID, 1, model_dir=shipped_model("push"))
     assert environment.single_action_space.shape == (7,)
-    with pytest.raises(ValueError, match="give model_dir, or the task of a shipped one"):
-        gymnasium.make_vec(ID, 1)
-    with pytest.raises(ValueError, match="autoreset_mode NextStep is not served"):
-        made(autoreset_mode="NextStep")
-    with pytest.raises(ValueError, match=r"unknown setting 'reward\.treshold'"):
-        made(settings={"reward.treshold": 1})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"task": None}, "give model_dir, or the task of a shipped one"),
+        ({"model_dir": "absent"}, "absent holds no manifest.json; name the folder of a trained world model"),
+        ({"model_dir": shipped_model("push")}, "knows the tasks .*, not 'push_cube'; take one of these"),
+        ({"task": "stack"}, "no world model is shipped for task 'stack' .*train one with"),
+        ({"num_envs": 0}, "num_envs must be a whole number >= 1, got 0"),
+        ({"num_envs": 2.5}, "num_envs must be a whole number >= 1, got 2.5"),
+        ({"autoreset_mode": "NextStep"}, "autoreset_mode 'NextStep' is not served; take SameStep or Disabled"),
+        ({"autoreset_mode": "Never"}, "autoreset_mode 'Never' is not served"),
+        ({"settings": {"reward.treshold": 1}}, r"unknown setting 'reward\.treshold'"),
+        ({"starts": "absent"}, "there is no starts file absent; copy the model folder again"),
+        ({"observations": "latents"}, "observations 'latents': give a tuple of image, state, latents, positions"),
+        ({"observations": ("latent",)}, r"observations \('latent',\): give a tuple of image, state"),
+        ({"observations": ()}, r"observations \(\): give a tuple"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_value_and_remedy(arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises((ValueError, FileNotFoundError), match=words) as refusal:
+        gymnasium.make_vec(ID, **{"num_envs": 1, "task": "push_cube", **arguments})
+    assert "\n" not in str(refusal.value)
+
+
+def test_num_envs_belongs_to_make_vec() -> None:
+    with pytest.raises(ValueError, match=r"for num_envs take gymnasium\.make_vec"):
+        gymnasium.make(ID, task="push_cube", num_envs=3)

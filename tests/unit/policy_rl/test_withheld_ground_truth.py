@@ -74,6 +74,14 @@ def test_neither_model_nor_policy_has_an_input_or_output_for_positions(bag: Path
     assert "the recorded ground truth is not used (data.ground_truth)" in models.manifest["data"]["summary"]
 
 
+def test_the_state_and_that_at_success_can_take_the_place_of_positions(bag: Path, tmp_path: Path) -> None:
+    config = settings(False, **{"tokenizer.success_state": True})
+    models = load_model_folder(model_of(bag, config, tmp_path))
+    values = 2 * SPEC.tool_dim
+    assert models.tokenizer.num_positions == models.action.done.num_positions == values and models.probe is None
+    assert make_policy(config, tmp_path / "model").encoder.num_positions == values
+
+
 def test_such_a_model_is_judged_by_pictures_also_where_the_simulator_knows_positions(bag: Path, tmp_path: Path) -> None:
     models = load_model_folder(model_of(bag, settings(False), tmp_path))
     config = settings(False, task="push_cube")

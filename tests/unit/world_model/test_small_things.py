@@ -13,7 +13,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.types import Episode, FloatArray
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model.tokenizer import Tokenizer
-from wm_nodes.world_model.training.tokenizer import recorded_targets, train_tokenizer, worst_error
+from wm_nodes.world_model.training.tokenizer import recorded_targets, success_states, train_tokenizer, worst_error
 from wm_nodes.world_model.validation.pictures import varying_error
 
 SIZE = 32
@@ -58,6 +58,15 @@ def test_the_targets_of_a_frame_are_the_action_taken_there_and_whether_the_task_
     np.testing.assert_array_equal(targets[0, :5, :3], recorded.actions[0])
     assert np.isnan(targets[0, 5, :3]).all() and np.isnan(targets[1, 3:, :3]).all()
     np.testing.assert_array_equal(targets[0, :, 3], [0, 0, 0, 0, 0, 1])
+
+
+def test_the_state_at_success_is_known_up_to_the_first_success_and_nowhere_else() -> None:
+    succeeds, fails = make_episode(SPEC, 0, 3), replace(make_episode(SPEC, 1, 3), success=np.zeros(4, bool))
+    succeeds = replace(succeeds, success=np.array([False, False, True, True]))
+    now, reached = np.split(success_states(stack_episodes([succeeds, fails], TASKS)), 2, axis=-1)
+    np.testing.assert_array_equal(now, [succeeds.states, fails.states])
+    np.testing.assert_array_equal(reached[0, :3], succeeds.states[[2, 2, 2]])
+    assert np.isnan(reached[0, 3]).all() and np.isnan(reached[1]).all()
 
 
 def test_the_worst_error_is_the_mean_of_the_worst_fiftieth_of_a_frames_pixels() -> None:

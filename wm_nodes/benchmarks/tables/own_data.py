@@ -7,6 +7,8 @@ FILE = "own_data.jsonl"
 
 def without_positions() -> Rows:
     for run in lines(FILE):
+        if "control" in run:
+            continue
         if pair := run.get("paired"):
             gain = interval(100 * pair["difference"], 100 * pair["low"], 100 * pair["high"], 1)
         else:

@@ -41,7 +41,7 @@ from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_model.success_reader import load_success_reader
-from wm_nodes.video_rl.execution_reward import load_execution_reward
+from wm_nodes.video_rl.execution_reward import make_execution_reward
 from wm_nodes.video_rl.heldout_metrics import Yardstick, make_yardstick, measure_clips, measure_executability
 from wm_nodes.video_rl.reference_reward import load_probe, score_clips
 from wm_nodes.video_rl.sampling import sample_by_ode
@@ -180,10 +180,9 @@ class Outcome(RecordedTrainings[OutcomePlan]):
         metrics |= measure_executability(positions, heldout, by, folder.clip["stride"])
         config = config.with_values(judge=judge_or_embedded(config.judge))
         fps = clip_fps(self.heldout_bags[0], config.model.stride)
-        imagined = load_execution_reward(config.with_values(rewards={EXECUTION: 1.0}), folder, heldout, by.probe)
-        done = {"accepted": torch.from_numpy(_accepted(frames, heldout, config, given, fps))}
-        if imagined is not None:
-            done["execution_success"] = imagined.score(frames, heldout)["execution_success"]
+        imagined = make_execution_reward(config, folder, heldout, by.probe).score(frames, heldout)
+        done = {"accepted": torch.from_numpy(_accepted(frames, heldout, config, given, fps)),
+                "execution_success": imagined["execution_success"]}
         shares = done | {f"{name}_executed": some * metrics["executed_success"] for name, some in done.items()}
         return {name: float(values.mean()) for name, values in ({n: metrics[n] for n in METRICS} | shares).items()}
 

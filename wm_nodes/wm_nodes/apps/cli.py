@@ -47,6 +47,7 @@ GROUPS = {
         "collect": "episodes of tasks in the simulator, planned and scripted",
         "view": "a recording, or a run, on a live page of this host",
         "rescore": "score a recording again, compare bit for bit",
+        "follow-clips": "a video model's clips as episodes that a policy is cloned from",
         "retrain": "train a video model again on a run's recorded clips and scores",
         "recover-bag": "bring back a recording whose process was killed",
         "import rosbag": "plain ROS bags of your robot into one of ours, by a contract",

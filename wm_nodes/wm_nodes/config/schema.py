@@ -109,6 +109,9 @@ class TokenizerConfig(SettingsSection):
     probe_weight: NonNegativeFloat = 0.1
     """Weight of the loss of the positions that a probe reads off the latents; without ground truth, of the action and
     the success that were recorded with the frame."""
+    success_state: bool = False
+    """Without ground truth: the state, and the state at which the episode succeeds, take the places of the positions
+    that model and done heads learn to say."""
     probe_depth: PositiveInt = 1
     """Hidden layers of the probe."""
     probe_iterations: NonNegativeInt = 0

@@ -177,7 +177,7 @@ def model_from_data(
     with explain_memory(device, tokenizer__batch_size=config.tokenizer.batch_size):
         tokenizer, tokenizer_metrics = train_tokenizer(data.training, config, config.seed, run_dir)
     probe: PositionProbe | None = None
-    if tokenizer.num_positions:
+    if spec.ground_truth_names:
         probe, _ = train_position_probe(data.training, config, config.seed, run_dir)
     if not config.world_model.part_steps and (steps := data.training.num_steps) > FEW_STEPS:
         say(f"every iteration rolls {steps} steps out; --world_model.part_steps {FEW_STEPS} takes random ones, faster")

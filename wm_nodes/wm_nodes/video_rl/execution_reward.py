@@ -4,8 +4,10 @@ Shapes: N clips, E recordings, F frames, H W 3 image, P positions. Places of the
 No simulator is asked, and nothing is known of how the recording of a clip's context ended.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +24,7 @@ from wm_nodes.core.types import FloatArray
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.world_model import DeviceEnvironment, WorldModels, load_model_folder
+from wm_nodes.world_model.imagined_episodes import imagined_spec
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.positions import columns_of, probe_targets
 
@@ -40,14 +43,19 @@ DECIMALS = 6
 def load_execution_reward(
     config: VideoRlConfig, folder: VideoFolder, recordings: Clips, probe: PositionProbe
 ) -> "ExecutionReward | None":
+    """Return make_execution_reward(), or None where `execution` has no weight. Raises as that."""
+    return make_execution_reward(config, folder, recordings, probe) if config.rewards.get(EXECUTION) else None
+
+
+def make_execution_reward(
+    config: VideoRlConfig, folder: VideoFolder, recordings: Clips, probe: PositionProbe
+) -> "ExecutionReward":
     """Return the reward of clips of `folder` by the action world model of config.execution.model, or the shipped one of
-    the task, on the folder's device; None where `execution` has no weight.
+    the task, on the folder's device.
 
     Raises:
         ValueError: the model does not fit the recordings; as ExecutionReward.
     """
-    if not config.rewards.get(EXECUTION):
-        return None
     model_dir = Path(config.execution.model) if config.execution.model else shipped_model(config.task)
     models = load_model_folder(model_dir, folder.device)
     spec = recordings.spec
@@ -57,6 +65,17 @@ def load_execution_reward(
     remedy = "name another execution.model, or draw contexts from recordings that this one was trained with"
     agree(tool_spec(spec), models.spec, f"{model_dir} was trained with", MODEL_FIELDS, simulated=remedy)
     return ExecutionReward(models, folder, recordings, probe)
+
+
+class FollowedStep(NamedTuple):
+    """A step of N paths that an action world model follows."""
+
+    actions_NA: Tensor
+    """float32 (N, A) in [-1, 1], what was commanded."""
+    signal_N: Tensor
+    """float32 (N,), the done signal after it."""
+    arm: DeviceEnvironment
+    """What is shown after it; changes in place with the next step."""
 
 
 class ExecutionReward:
@@ -99,7 +118,7 @@ class ExecutionReward:
         """
         paths = self.paths(frames, references)
         signal = torch.cat([
-            self._follow(paths[i : i + ROWS], references.select(torch.arange(i, min(i + ROWS, len(paths)))))
+            self._highest_signal(paths[i : i + ROWS], references.select(torch.arange(i, min(i + ROWS, len(paths)))))
             for i in range(0, len(paths), ROWS)
         ])
         return dict(zip(EXECUTION_SCORES, (signal, (signal > self.threshold).double()), strict=True))
@@ -117,24 +136,33 @@ class ExecutionReward:
         paths: FloatArray = places.astype(np.float32)
         return paths
 
-    @torch.inference_mode()
-    def _follow(self, paths: FloatArray, references: Clips) -> Tensor:
-        """Return the highest done signal of each path, which is commanded on straight lines between frames."""
-        count, steps = len(paths), self._stride * (paths.shape[1] - 1)
+    def spec(self, num_frames: int) -> EnvironmentSpec:
+        """Return what the clips of so many frames are followed in, as one environment."""
+        steps = self._stride * (num_frames - 1)
         spec = replace(self._models.spec, task=self._task, max_episode_steps=steps)
+        return imagined_spec(spec, f"wm/{self._task}", self._models.sha256, 1)
+
+    def follow(self, paths: FloatArray, references: Clips) -> Iterator[FollowedStep]:
+        """Command paths (N, F, 3) on straight lines between frames, without an early end; a step is given as soon as it
+        is imagined. references: the recordings that the paths begin with."""
+        count, spec = len(paths), self.spec(paths.shape[1])
         starts = references.frames[:, 0].cpu().numpy(), references.first_states()
         endless = self._reward.with_values(success_threshold=1.0)
         arm = DeviceEnvironment(self._models, spec, starts, endless, num_envs=count, with_goals=False)
         arm.reset(torch.ones(count, dtype=torch.bool, device=arm.device), torch.arange(count, device=arm.device))
         path = torch.from_numpy(paths).to(arm.device)
         scale = torch.tensor(spec.action_scale, device=arm.device)
-        best = torch.zeros(count, device=arm.device)
-        for step in range(steps):
+        for step in range(spec.max_episode_steps):
             frame, share = step // self._stride, (step % self._stride + 1) / self._stride
             target = path[:, frame] + share * (path[:, frame + 1] - path[:, frame])
-            best = torch.maximum(best, arm.step(((target - arm.states_NP) / scale).clamp(-1, 1)).signal_N)
+            actions = ((target - arm.states_NP) / scale).clamp(-1, 1)
+            yield FollowedStep(actions, arm.step(actions).signal_N, arm)
         arm.check_finite()
-        return best.double().cpu()
+
+    @torch.inference_mode()
+    def _highest_signal(self, paths: FloatArray, references: Clips) -> Tensor:
+        """Return the highest done signal of each path, float64 (N,)."""
+        return torch.stack([step.signal_N for step in self.follow(paths, references)]).amax(0).double().cpu()
 
 
 def check_followable(spec: EnvironmentSpec, tool_dim: int) -> None:

@@ -134,7 +134,7 @@ def load_model_folder(
     tokenizer_config = TokenizerConfig.model_validate(manifest["tokenizer"])
     config = WorldModelConfig.model_validate(manifest["world_model"])
     num_tasks, spec = len(manifest["tasks"]), model_spec(folder, manifest)
-    num_positions = num_positions_of(spec)
+    num_positions = num_positions_of(spec, success_state=tokenizer_config.success_state)
     tokenizer = Tokenizer(tokenizer_config, spec.height, spec.width, num_positions)
     sizes = {"num_tokens": tokenizer.num_tokens, "latent_dim": tokenizer.latent_dim, "num_positions": num_positions}
     action = action_model_class(tokenizer_config.kind)(

@@ -18,9 +18,12 @@ def columns_of(task: str, thing: str) -> list[int]:
     return [i for i, name in enumerate(position_names(task)) if name.startswith(f"{thing}_")]
 
 
-def num_positions_of(spec: EnvironmentSpec) -> int:
-    """P, how many values the models of an environment read off frames: none where it has no ground truth."""
-    return (len(position_names(spec.task)) or spec.ground_truth_dim) if spec.ground_truth_names else 0
+def num_positions_of(spec: EnvironmentSpec, *, success_state: bool = False) -> int:
+    """P, how many values the models of an environment read off frames: without ground truth none, or the state
+    and the one at success (tokenizer.success_state)."""
+    if not spec.ground_truth_names:
+        return 2 * spec.tool_dim if success_state else 0
+    return len(position_names(spec.task)) or spec.ground_truth_dim
 
 
 def probe_targets(ground_truth: FloatArray, task: str) -> FloatArray:

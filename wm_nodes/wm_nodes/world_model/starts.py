@@ -27,8 +27,11 @@ def load_starts(path: Path, task: str = "") -> tuple[UInt8Array, FloatArray]:
     """Real frames uint8 (M, H, W, 3) and states float32 (M, P) to imagine from, those in the scene of `task`.
 
     Raises:
-        ValueError: no such file, or none of its starts is in that scene.
+        FileNotFoundError: no such file.
+        ValueError: it is no starts file, or none of its starts is in that scene.
     """
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no starts file {path}; {STARTS_REMEDY}")
     tensors = read_tensors(path, STARTS_REMEDY)
     missing = {"images", "states"} - tensors.keys()
     if missing or not len(tensors["images"]):

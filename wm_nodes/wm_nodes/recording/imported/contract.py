@@ -198,7 +198,7 @@ class Contract(SettingsSection):
         return [name for source in self.actions for name in source.value_names]
 
     @property
-    def probe_names(self) -> list[str]:
+    def probed_names(self) -> list[str]:
         return [name for source in self.probes for name in source.value_names]
 
     @property
@@ -229,7 +229,7 @@ class Contract(SettingsSection):
         if len(set(sizes.values())) > 1:
             raise ValueError(f"cameras have the sizes {sizes}; give all of them one size")
         for kind, names in (
-            ("state", self.state_names), ("action", self.action_names), ("probe", self.probe_names)
+            ("state", self.state_names), ("action", self.action_names), ("probe", self.probed_names)
         ):
             if twice := {name for name in names if names.count(name) > 1}:
                 raise ValueError(f"several {kind} values are called {', '.join(sorted(twice))}; give them `names`")

@@ -33,7 +33,7 @@ def spec_of_contract(contract: Contract, max_steps: int) -> EnvironmentSpec:
         action_names=tuple(contract.action_names), action_units=tuple(_units(actions)),
         action_scale=tuple((high - low) / 2 for source in actions for low, high in zip(source.low, source.high)),
         state_names=tuple(contract.state_names), state_units=tuple(_units(state)),
-        ground_truth_names=tuple(contract.probe_names),
+        ground_truth_names=tuple(contract.probed_names),
         control_period_s=1 / contract.rate_hz, max_episode_steps=max_steps,
     )
 

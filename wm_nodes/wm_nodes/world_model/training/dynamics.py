@@ -26,7 +26,7 @@ from wm_nodes.world_model.state_change import StateChange
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.device_rollout import roll_out_on_device
-from wm_nodes.world_model.training.tokenizer import episode_targets, foreground_weight, probe_loss
+from wm_nodes.world_model.training.tokenizer import foreground_weight, probe_loss, probed_targets
 
 M = TypeVar("M", ActionModel, TokenActionModel)
 
@@ -103,7 +103,7 @@ def tokenise_episodes(tokenizer: Tokenizer, episodes: EpisodeArrays) -> LatentEp
         images=torch.from_numpy(episodes.images), latents=latents, mean_change_S=change,
         states=torch.from_numpy(episodes.states).to(device), actions=torch.from_numpy(episodes.actions).to(device),
         success=torch.from_numpy(episodes.success).to(device),
-        truth=torch.from_numpy(episode_targets(episodes)).to(device),
+        truth=torch.from_numpy(probed_targets(episodes, states=tokenizer.num_positions > 0)).to(device),
         labelled=torch.from_numpy(episodes.labelled).to(device),
         step_mask=torch.from_numpy(episodes.step_mask).to(device),
     )

@@ -38,53 +38,57 @@ def train_tokenizer(
 
     Loss: L1 + 2 L2 on pixels, foreground weighed 1 + tokenizer.foreground_weight; a probe that reads object and tool
     positions off the latents, whose gradient reaches the encoder; for lfq the entropy and commitment terms. Where the
-    episodes have no ground truth, the probe reads recorded_targets instead and is not kept, and the worst pixels of
-    each frame count more (tokenizer.worst_weight): both keep small things encoded.
+    episodes have no ground truth, a probe of recorded_targets, which is not kept, and the worst pixels of each frame
+    count too (tokenizer.worst_weight): both keep small things encoded.
     """
     settings = config.tokenizer
     height, width = episodes.images.shape[2:4]
     frames = np.flatnonzero(episodes.frame_mask)
     images = episodes.images.reshape(-1, height, width, 3)
-    truth = episode_targets(episodes).reshape(len(images), -1)
+    truth = probed_targets(episodes, states=settings.success_state).reshape(len(images), -1)
     with initial_weights(seed, "tokenizer_init"):
         codec = Tokenizer(settings, height, width, truth.shape[-1])
     _set_statistics(codec, images[frames], truth[frames], seed)
     codec.to(compute_device(config.device))
-    probe, has_truth = codec.probe, truth.shape[-1] > 0
+    recorded = np.zeros((len(images), 0), np.float32)
+    recorded_probe: nn.Module | None = None
     trained: nn.Module = codec
-    if probe is None:
-        truth = recorded_targets(episodes).reshape(len(images), -1)
-        mean, std = position_statistics(truth[frames])
-        truth = (truth - mean) / std
+    if not episodes.ground_truth.shape[-1]:
+        recorded = recorded_targets(episodes).reshape(len(images), -1)
+        mean, std = position_statistics(recorded[frames])
+        recorded = (recorded - mean) / std
         with initial_weights(seed, "recorded_probe_init"):
-            probe = make_probe(codec.num_tokens * codec.latent_dim, settings, truth.shape[-1]).to(codec.device)
-        trained = nn.ModuleDict({"tokenizer": codec, "probe": probe})
+            recorded_probe = make_probe(codec.num_tokens * codec.latent_dim, settings, recorded.shape[-1])
+        trained = nn.ModuleDict({"tokenizer": codec, "probe": recorded_probe.to(codec.device)})
 
-    def read(iteration: int) -> tuple[Tensor, Tensor, Tensor]:
+    def read(iteration: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         rows = numpy_stream(seed, "tokenizer_batch", iteration).choice(frames, settings.batch_size)
         generator = torch_stream(seed, "latent_noise", iteration)
         noise = torch.randn((len(rows), codec.num_tokens, codec.latent_dim), generator=generator)
-        return torch.from_numpy(images[rows]), torch.from_numpy(truth[rows]), noise
+        targets = torch.from_numpy(truth[rows]), torch.from_numpy(recorded[rows])
+        return torch.from_numpy(images[rows]), *targets, noise
 
     batches = BackgroundBatches(read, codec.device)
 
     def loss(iteration: int) -> dict[str, Tensor]:
-        shown, positions, noise = batches(iteration)
+        shown, positions, said, noise = batches(iteration)
         pixels = codec.to_pixels(shown)
         with compute_context(codec.device):
             features = codec.features(pixels)
             latents = codec.bottleneck(features)
             noisy = latents + LATENT_NOISE * noise if codec.kind == "continuous" else latents
             reconstruction = codec.decode_pixels(noisy)
-            probed = probe(noisy.flatten(1)).float()
+            probed = codec.read_state_normalised(noisy)
+            spoken = recorded_probe(noisy.flatten(1)).float() if recorded_probe else said
         error = reconstruction - pixels
         weight = foreground_weight(pixels, codec.background, settings)
         errors = error.abs() + 2 * error.square()
         terms = {"pixel": (weight * errors).mean() / weight.mean()}
-        terms["probe"] = probe_loss(codec, probed, positions) if has_truth else known_huber(probed, positions)
+        terms["probe"] = probe_loss(codec, probed, positions)
         terms["loss"] = terms["pixel"] + settings.probe_weight * terms["probe"]
-        if not has_truth:
-            terms["worst"] = worst_error(errors)
+        if recorded_probe:
+            terms["recorded"], terms["worst"] = known_huber(spoken, said), worst_error(errors)
+            terms["loss"] = terms["loss"] + settings.probe_weight * terms["recorded"]
             terms["loss"] = terms["loss"] + settings.worst_weight * terms["worst"]
         if codec.kind == "lfq":
             terms["entropy"] = entropy_loss(features)
@@ -124,6 +128,24 @@ def recorded_targets(episodes: EpisodeArrays) -> FloatArray:
     acted = np.pad(acted, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
     targets: FloatArray = np.concatenate((acted, episodes.success), -1)
     return targets.astype(np.float32, copy=False)
+
+
+def success_states(episodes: EpisodeArrays) -> FloatArray:
+    """The state of each frame, and the state at the episode's first success (E, T + 1, 2 S): without ground truth the
+    nearest to where the tool is and where it should be. The latter is NaN after the success, and where an episode does
+    not succeed: its goal was not recorded."""
+    done = episodes.success.any(-1) & episodes.frame_mask
+    first = done.argmax(1)
+    before = done.any(1)[:, None] & (np.arange(done.shape[1]) <= first[:, None])
+    reached = episodes.states[np.arange(len(episodes)), first][:, None]
+    targets: FloatArray = np.concatenate((episodes.states, np.where(before[..., None], reached, np.nan)), -1)
+    return targets.astype(np.float32, copy=False)
+
+
+def probed_targets(episodes: EpisodeArrays, *, states: bool) -> FloatArray:
+    """What a model's own probe learns to read (E, T + 1, P): episode_targets; without ground truth
+    success_states, or if not `states` nothing."""
+    return success_states(episodes) if states and not episodes.ground_truth.shape[-1] else episode_targets(episodes)
 
 
 def episode_targets(episodes: EpisodeArrays) -> FloatArray:
