@@ -3,6 +3,7 @@ trained in a model of them: recorded by the graph, modelled from the recording, 
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ from examples import own_environment
 from wm_msgs.action import Rollout, Train
 from wm_msgs.srv import StopRecording
 from wm_nodes.apps.cli import DONE, NOT_ACCEPTED, main
+from wm_nodes.apps.policy_pictures import write_pictures
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.specs import SpecMismatch, agree
@@ -204,6 +206,17 @@ def test_the_example_records_what_trained_weights_do_in_the_real_environment(
         np.testing.assert_allclose(episode.actions, wanted, atol=1e-5)
 
 
+@pytest.mark.parametrize("own", ["pendulum"], indirect=True, scope="module")
+def test_a_report_shows_what_the_policy_does_in_gymnasium_beside_what_the_model_imagines(
+    model_dir: Path, config: RunConfig, tmp_path: Path
+) -> None:
+    config = config.with_values(evaluation=config.evaluation.with_values(environment="gymnasium"))
+    pictures = write_pictures(tmp_path, config, model_dir, make_policy(config, model_dir), 7)
+    moving, *strips = [picture.path for picture in pictures]
+    assert moving.suffix == ".gif" and [strip.suffix for strip in strips] == [".png"] * 2
+    assert all(path.stat().st_size > 1000 for path in (moving, *strips))
+
+
 @of_the_arm
 @pytest.mark.slow
 @pytest.mark.parametrize("measured_in", ["none", "examples.own_environment:make"])
@@ -224,6 +237,7 @@ def test_train_policy_needs_no_task_and_says_where_nothing_real_was_measured(
     assert len(when_made) == 4 and summary["acceptance"]["criteria"][:4] == when_made
     report = (tmp_path / "run" / "report.html").read_text()
     assert ("Nothing real was measured" in report) is (measured_in == "none")
+    assert re.findall("<h2>(Real and imagined|Training)", report) == ["Training"], "nothing is played on a robot"
     assert (summary["real_after"] or {"episodes": None})["episodes"] == (None if measured_in == "none" else 4)
 
 

@@ -3,16 +3,17 @@
 Shapes: T steps, H W 3 image.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.config.tasks import success
+from wm_nodes.config.tasks import success_or_recorded
 from wm_nodes.core.specs import SOURCE_SIMULATOR
 from wm_nodes.core.types import Environment, Episode, FloatArray, UInt8Array
-from wm_nodes.environments.registry import make_environment
+from wm_nodes.environments.registry import GYMNASIUM, is_simulated, make_environment
 from wm_nodes.policy_rl.factories import models_of
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
@@ -60,36 +61,44 @@ class SideBySide:
 def write_pictures(
     run_dir: Path, config: RunConfig, model_dir: Path, policy: ImagePolicy, first_seed: int
 ) -> list[Picture]:
-    """Play NUM_STRIPS episodes of the policy in the simulator, imagine the same actions, and draw both; and the curves.
+    """Play NUM_STRIPS episodes of the policy where it is measured, imagine the same actions, and draw both; and the
+    curves. On a robot, or whatever else an environment of one's own is, nothing is played.
 
     Writes PNGs and a GIF to <run_dir>/pictures.
     """
-    environment = make_environment(config, config.evaluation.environment, num_envs=1, seed=config.seed)
-    try:
-        episodes = [play(environment, policy, first_seed + i) for i in range(NUM_STRIPS)]
-    finally:
-        environment.close()
     folder, pictures = run_dir / "pictures", list[Picture]()
-    pairs = side_by_side(models_of(Path(model_dir), config.device), episodes, config)
-    moving = Picture("Real and imagined", "The episodes below, as they pass.", folder / MOVING)
-    moving_picture([pair.rows for pair in pairs], moving.path, marks=[pair.done for pair in pairs])
-    pictures.append(moving)
-    for index, pair in enumerate(pairs):
-        path = folder / f"film_strip_{index}.png"
-        rows = pair.rows | ({} if pair.goal is None else {"goal": pair.goal[None]})
-        film_strip(rows, path, marks=pair.done)
-        pictures.append(Picture(f"Real and imagined, episode {index + 1}", describe(pair, first_seed + index), path))
+    if is_simulated(config) or config.evaluation.environment == GYMNASIUM:
+        pictures += _strips(folder, config, model_dir, policy, first_seed)
     drawn = curves(run_dir / FILE_NAME, folder / "curves.png")
     if drawn is not None:
         pictures.append(Picture("Training", "In the world model, by policy update.", drawn))
     return pictures
 
 
+def _strips(
+    folder: Path, config: RunConfig, model_dir: Path, policy: ImagePolicy, first_seed: int
+) -> Iterator[Picture]:
+    environment = make_environment(config, config.evaluation.environment, num_envs=1, seed=config.seed)
+    try:
+        episodes = [play(environment, policy, first_seed + i) for i in range(NUM_STRIPS)]
+    finally:
+        environment.close()
+    pairs = side_by_side(models_of(Path(model_dir), config.device), episodes, config)
+    moving = Picture("Real and imagined", "The episodes below, as they pass.", folder / MOVING)
+    moving_picture([pair.rows for pair in pairs], moving.path, marks=[pair.done for pair in pairs])
+    yield moving
+    for index, pair in enumerate(pairs):
+        path = folder / f"film_strip_{index}.png"
+        rows = pair.rows | ({} if pair.goal is None else {"goal": pair.goal[None]})
+        film_strip(rows, path, marks=pair.done)
+        yield Picture(f"Real and imagined, episode {index + 1}", describe(pair, first_seed + index), path)
+
+
 def play(environment: Environment, policy: ImagePolicy, seed: int) -> Episode:
-    """One episode without action noise; `environment` has one slot and ground truth."""
+    """One episode without action noise; `environment` has one slot."""
     observation = environment.reset(None, np.array([seed], np.uint64))
-    images, states, actions, truths = [observation.image[0]], [observation.state[0]], list[FloatArray](), []
-    truths.append(environment.ground_truth[0])  # type: ignore[attr-defined]
+    images, states, actions, said = [observation.image[0]], [observation.state[0]], list[FloatArray](), [False]
+    truths = [getattr(environment, "ground_truth", np.zeros((1, 0), np.float32))[0]]
     while True:
         action = policy.act(observation.image, observation.state).actions
         result = environment.step(action)
@@ -98,13 +107,15 @@ def play(environment: Environment, policy: ImagePolicy, seed: int) -> Episode:
         images.append(observation.image[0])
         states.append(observation.state[0])
         truths.append(result.ground_truth[0])
+        said.append(bool(result.success_probability[0] > 0.5))
         if result.terminated[0] or result.truncated[0]:
             break
     spec, truth = environment.spec, np.stack(truths)
     return Episode(
         images=np.stack(images), states=np.stack(states), actions=np.stack(actions), ground_truth=truth,
-        success=success(spec.task, truth), rewards=np.full(len(actions), np.nan, np.float32),
-        terminated=bool(result.terminated[0]), truncated=bool(result.truncated[0]), task=spec.task,
+        success=success_or_recorded(spec.task, truth, np.array(said)),
+        rewards=np.full(len(actions), np.nan, np.float32), terminated=bool(result.terminated[0]),
+        truncated=bool(result.truncated[0]), task=spec.task,
         instruction=getattr(environment, "instructions", (spec.instruction,))[0], behaviour="policy", seed=seed,
         episode_id=seed, source=SOURCE_SIMULATOR,
     )
@@ -119,7 +130,7 @@ def side_by_side(models: WorldModels, episodes: list[Episode], config: RunConfig
     if models.text is not None:
         goals = imagine_goals(
             models.text, models.tokenizer, arrays.images[:, 0], arrays.instructions, tasks,
-            horizon=config.simulation.max_episode_steps, threshold=config.reward.goal_threshold,
+            horizon=models.spec.max_episode_steps, threshold=config.reward.goal_threshold,
         ).goals
     pairs = []
     for row, episode in enumerate(episodes):

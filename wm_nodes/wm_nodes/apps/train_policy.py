@@ -144,7 +144,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
     ))
     write_summary(run_dir, summary)
     policy = load_policy(config, found.model_dir, found.policy)
-    pictures = write_pictures(run_dir, config, found.model_dir, policy, HELDOUT.first) if is_simulated(config) else []
+    pictures = write_pictures(run_dir, config, found.model_dir, policy, HELDOUT.first)
     report = write_report(run_dir, summary, pictures, config_text=dump_config(config))
     if summary.rounds:
         console.print(rounds_table(summary))
