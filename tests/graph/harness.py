@@ -29,6 +29,7 @@ from rclpy.qos import QoSProfile, qos_profile_action_status_default
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.errors import WireError
+from wm_nodes.core.files import write_atomic
 from wm_nodes.ros.clients import goal_result
 from wm_nodes.ros.endpoint_matching import EndpointTable
 from wm_nodes.ros.qos import topic
@@ -274,7 +275,7 @@ class Graph:
             return run
         text = dump_config(load_config(str(run), {name.replace("__", "."): value for name, value in settings.items()}))
         path = self.folder / f"config_{zlib.crc32(text.encode()):08x}.yaml"
-        path.write_text(text, encoding="utf-8")
+        write_atomic(path, text.encode())  # a node that was started before may read it now
         return path
 
     def environment(self) -> dict[str, str]:

@@ -2,6 +2,7 @@
 trained in a model of them: recorded by the graph, modelled from the recording, trained in over DDS."""
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -29,6 +30,7 @@ from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.recording import read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.reports.summary import read_summary
+from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model import DeviceEnvironment, load_model_folder
 from wm_nodes.world_model.validation.acceptance import accept_world_model
 
@@ -179,6 +181,27 @@ def test_the_example_records_an_environment_through_the_graph(
     ended = [episode for episode in episodes if episode.terminated or episode.truncated]
     won = sum(episode.success.any() for episode in ended)
     assert f"{len(ended)} episodes, {won} succeed" in done.stdout and len(ended) >= 4
+
+
+def test_the_example_records_what_trained_weights_do_in_the_real_environment(
+    model_dir: Path, config: RunConfig, own: str, ros_domain: int, tmp_path: Path
+) -> None:
+    trained, weights = make_policy(config.with_values(seed=7), model_dir), tmp_path / "trained.safetensors"
+    save_weights(trained, weights)
+    settings = [word for name, value in OWN[own].items() if name != "task" for word in (f"--{name}", str(value))]
+    done = subprocess.run(
+        [sys.executable, "-m", "examples.record", str(tmp_path / "bag"), *settings, "--model-dir", str(model_dir),
+         "--initial-policy", str(weights), "--deterministic", "--steps", "20", "--num-envs", "2",
+         "--domain-id", str(ros_domain)],
+        capture_output=True, encoding="utf-8", timeout=200, check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    episodes = [*read_episodes(tmp_path / "bag", expected=configured_spec(config))]
+    assert len(episodes) >= 4 and {episode.behaviour for episode in episodes} == {"policy"}
+    for episode in episodes:
+        wanted = trained.act(episode.images[:-1], episode.states[:-1]).actions
+        np.testing.assert_allclose(episode.actions, wanted, atol=1e-5)
 
 
 @of_the_arm

@@ -1,4 +1,5 @@
 """PPO in one file, shaped as CleanRL's, that learns to reach in the world model (policy_rl/gym.py) from its latents.
+Measured, seed 0, 116 CPU s: imagined success 0 % after update 1, 68 % after 40; real 79 of 100 (95 %: 70 to 86).
 
 python -m examples.imagined_ppo 40 100
 """
@@ -19,8 +20,8 @@ class Agent(nn.Module):
         self.actor, self.critic = (
             nn.Sequential(nn.Linear(num_latents, 128), nn.Tanh(), nn.Linear(128, 128), nn.Tanh(), nn.Linear(128, size))
             for size in (num_actions, 1))
-        for zero in self.critic[-1].parameters():
-            nn.init.zeros_(zero)  # until the first success no step is better than another
+        for zero in (*self.actor[-1].parameters(), *self.critic[-1].parameters()):
+            nn.init.zeros_(zero)  # no direction, and no step, is better than another until the first success
         self.log_std = nn.Parameter(torch.full((num_actions,), -0.5))
 
     def forward(self, latents: Tensor) -> tuple[torch.distributions.Normal, Tensor]:
@@ -44,9 +45,8 @@ def main(words: list[str] | None = None) -> None:
                 for i in np.flatnonzero(truncated):  # time is up: what would follow is worth what the critic says
                     rewards[i] += GAMMA * agent(torch.as_tensor(infos["final_obs"][i][LATENTS]))[1]
                 won += terminated[terminated | truncated].tolist()
-                goes_on, latents = torch.as_tensor(~(terminated | truncated)), torch.as_tensor(shown[LATENTS])
-                paid = torch.as_tensor(rewards).float()
-                rows.append((before, actions, policy.log_prob(actions).sum(1), values_N, paid, goes_on))
+                latents, paid, goes_on = map(torch.as_tensor, (shown[LATENTS], rewards, ~(terminated | truncated)))
+                rows.append((before, actions, policy.log_prob(actions).sum(1), values_N, paid.float(), goes_on))
             gain_N, next_N, gained = torch.zeros(NUM_ENVS), agent(latents)[1], torch.zeros(0)
             for *_, values_N, paid, goes_on in reversed(rows):
                 gain_N = paid + GAMMA * (next_N + LAMBDA * gain_N) * goes_on - values_N
@@ -59,6 +59,7 @@ def main(words: list[str] | None = None) -> None:
             clipped = torch.minimum(ratio * better, ratio.clamp(1 - CLIP, 1 + CLIP) * better).mean()
             optimizer.zero_grad()
             ((guessed - values[chosen] - gained[chosen]).square().mean() / 2 - clipped).backward()
+            nn.utils.clip_grad_norm_(agent.parameters(), 0.5)
             optimizer.step()
         print(f"update {update}: imagined success {np.mean(won or [False]):.1%}", flush=True)
     act = torch.no_grad()(lambda one: agent(torch.as_tensor(one[LATENTS]))[0].mean.clamp(-1, 1).numpy())

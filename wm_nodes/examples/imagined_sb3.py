@@ -1,6 +1,8 @@
 """Stable-Baselines3's PPO learns to reach in the world model (policy_rl/gym.py) from its latents.
 
 python -m examples.imagined_sb3 40 100
+
+Measured, seed 0, 113 CPU s: imagined success 3 % after update 1, 83 % after 40; real 94 of 100 (95 %: 88 to 97).
 """
 from typing import Any
 

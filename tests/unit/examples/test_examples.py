@@ -52,7 +52,7 @@ def test_ppo_from_nothing_succeeds_more_often_in_the_world_model_after_twelve_up
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rates = imagined_rates("imagined_ppo", 12, monkeypatch, tmp_path, capsys)
-    assert np.mean(rates[-4:]) > np.mean(rates[:4]) + 5  # points; measured 2 and 16, of 256 episodes
+    assert np.mean(rates[-4:]) > np.mean(rates[:4]) + 5  # points; measured 1 and 14, of 256 episodes
 
 
 def test_stable_baselines_trains_in_the_world_model_by_its_command(

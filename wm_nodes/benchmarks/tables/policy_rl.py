@@ -9,7 +9,6 @@ from wm_nodes.core.statistics import paired_difference
 
 STUDY, ARMS = "policy_rl_seed_study.jsonl", "policy_rl_against_exploiting.json"
 LIKELIHOOD, CONTROL = "policy_rl_likelihood.json", "policy_rl_scenes.json"
-FROM_CLIPS, PLANNED = "policy_rl_from_clips.json", "planned demonstrations"
 
 
 def push_cube() -> Rows:
@@ -61,22 +60,6 @@ def scenes_control() -> Rows:
         of = [one for one in rows if one["task"] == task]
         totals = (sum(one[f"real_{when}"]["successes"] for one in of) for when in ("before", "after"))
         yield task, ", ".join(str(one["seed"]) for one in of), *totals
-
-
-def from_clips() -> Rows:
-    rows = read(FROM_CLIPS)["rows"]
-    usual = {one["seed"]: one["success_after"] for one in rows if one["start"] == PLANNED and "success_after" in one}
-    for start, episodes in dict.fromkeys((one["start"], one["demonstrations"]) for one in rows):
-        of = [one for one in rows if (one["start"], one["demonstrations"]) == (start, episodes)]
-        trained = [one for one in of if "success_after" in one]
-        clone = [mean(one["success_before"]) for one in of]
-        after = [mean(one["success_after"]) for one in trained]
-        pairs = [(usual[one["seed"]], one["success_after"]) for one in trained if start != PLANNED]
-        first, last = ([x for pair in pairs for x in pair[i]] for i in (0, 1))
-        yield (
-            start, episodes, ", ".join(str(one["seed"]) for one in of), ", ".join(map(percent, clone)),
-            percent(mean(clone)), ", ".join(map(percent, after)), points(first, last) if pairs else "",
-        )
 
 
 def simulator_control() -> Rows:

@@ -54,13 +54,13 @@ class GraphClient:
         self._thread = threading.Thread(target=spin, args=(self._executor, self._stop.is_set), daemon=True)
         self._thread.start()
 
-    def rollout(self, steps: int, *, seed: int = 0) -> Rollout.Result:
-        """Let the policy act, with its noise, in so many lock-steps after a reset.
+    def rollout(self, steps: int, *, seed: int = 0, deterministic: bool = False) -> Rollout.Result:
+        """Let the policy act, by default with its noise, in so many lock-steps after a reset.
 
         Raises:
             GoalFailed: the rollout ended early. PeerLost: no policy node, or it ended meanwhile.
         """
-        goal = Rollout.Goal(steps=steps, seed=seed, reset=True)
+        goal = Rollout.Goal(steps=steps, seed=seed, reset=True, deterministic=deterministic)
         return self._run(self._rollout, "policy", goal, lambda message: None)
 
     def evaluate(
