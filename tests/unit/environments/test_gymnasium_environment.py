@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from drawn_pendulum import SETTINGS
 from gymnasium import spaces
 
@@ -93,13 +94,22 @@ def test_an_action_of_1_takes_a_share_of_its_range_and_single_values_are_a_state
     np.testing.assert_allclose(result.observation.state, [[-0.5, 0.75], [-0.5, 0.25]])
 
 
-@pytest.fixture
-def fetch_reach() -> Iterator[Environment]:
+def fetch(preset: str) -> Iterator[Environment]:
     if find_spec("gymnasium_robotics") is None:  # not imported here: MuJoCo chooses how to draw when it is imported
-        pytest.skip("FetchReach needs requirements/gym.txt")
-    environment = made({}, preset="fetch_reach")
+        pytest.skip(f"{preset} needs requirements/gym.txt")
+    environment = made({}, preset=preset)
     yield environment
     environment.close()
+
+
+@pytest.fixture
+def fetch_reach() -> Iterator[Environment]:
+    yield from fetch("fetch_reach")
+
+
+@pytest.fixture
+def fetch_push() -> Iterator[Environment]:
+    yield from fetch("fetch_push")
 
 
 def test_fetch_reach_shows_its_goal_in_both_cameras_and_says_success(fetch_reach: Environment) -> None:
@@ -113,6 +123,18 @@ def test_fetch_reach_shows_its_goal_in_both_cameras_and_says_success(fetch_reach
         result = fetch_reach.step(policy.act(shown.image, shown.state).actions)
         shown, success = result.observation, success | result.terminated
     assert success.all() and not result.valid.any()
+
+
+def test_the_controller_of_fetch_push_pushes_the_block_onto_the_spot(fetch_push: Environment) -> None:
+    policy = fetch_controller.push(load_config("fetch_push"))
+    shown = fetch_push.reset(seeds=np.array([4, 5], np.uint64))
+    places = policy.encoder(torch.from_numpy(shown.image))
+    assert (torch.linalg.norm(places[:, :2] - places[:, 2:], dim=1) > 0.05).all()
+    success = np.zeros(2, bool)
+    for _ in range(fetch_push.spec.max_episode_steps):
+        result = fetch_push.step(policy.act(shown.image, shown.state).actions)
+        shown, success = result.observation, success | result.terminated
+    assert success.all()
 
 
 def test_an_action_of_1_moves_fetch_by_about_a_centimetre(fetch_reach: Environment) -> None:
