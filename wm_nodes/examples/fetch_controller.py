@@ -61,7 +61,8 @@ class Push(Reach):
     """Above the block to its far side, down, then towards the spot."""
 
     def distribution(self, features_BF: Tensor, states_BS: Tensor) -> DiagonalGaussian:
-        block_B2, spot_B2, hand_B2, height_B = *features_BF.split(2, 1), states_BS[:, :2], states_BS[:, 2]
+        block_B2, spot_B2 = features_BF[:, :2], features_BF[:, 2:]
+        hand_B2, height_B = states_BS[:, :2], states_BS[:, 2]
         spot_B2 = spot_B2 + self.beside_m * torch.sin(100 * spot_B2.roll(1, 1))
         ahead_B2 = torch.nn.functional.normalize(spot_B2 - block_B2, dim=1)
         behind_B2, from_block_B2 = block_B2 - 0.06 * ahead_B2 - hand_B2, hand_B2 - block_B2

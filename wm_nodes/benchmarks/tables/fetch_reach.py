@@ -11,7 +11,8 @@ def beside_control() -> Rows:
         yield _beside_control(run["run"], [run])
     for name in dict.fromkeys(run["run"].split(", seed")[0] for run in made):
         its = [run for run in made if run["run"].startswith(name)]
-        yield _beside_control(f"{name}, {len(its)} seeds", its)
+        if len(its) > 1:
+            yield _beside_control(f"{name}, {len(its)} seeds", its)
 
 
 def _beside_control(name: str, its: list[Run]) -> tuple[str, ...]:
