@@ -14,6 +14,7 @@ import os
 import sys
 from pathlib import Path
 
+from wm_nodes.apps.cli import EXPECTED
 from wm_nodes.config.load import split_settings
 from wm_nodes.launching import arguments
 from wm_nodes.launching.graph_client import GraphClient
@@ -46,4 +47,7 @@ def main(words: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    try:
+        raise SystemExit(main())
+    except EXPECTED as error:
+        raise SystemExit(f"error: {error}") from None

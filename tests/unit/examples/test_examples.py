@@ -1,8 +1,11 @@
 """Every example runs by the command that it begins with."""
 
 import importlib
+import os
 import re
 import shlex
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -114,3 +117,13 @@ def test_the_own_task_is_collected_by_its_command(
 def test_an_example_has_20_to_40_lines() -> None:
     sizes = {path.stem: len(path.read_text(encoding="utf-8").splitlines()) for path in FOLDER.glob("own_*.py")}
     assert sorted(sizes) == sorted(NAMES) and all(20 <= size <= 40 for size in sizes.values()), sizes
+
+
+def test_the_recording_example_refuses_what_is_not_there_in_one_line(tmp_path: Path) -> None:
+    words = ["-m", "examples.record", str(tmp_path / "bag"), "--task", "push_cube", "--model-dir", str(tmp_path)]
+    done = subprocess.run(
+        [sys.executable, *words], capture_output=True, encoding="utf-8", timeout=100, check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert done.returncode and done.stderr.count("\n") == 1
+    assert f"error: model_dir '{tmp_path}' holds no manifest.json" in done.stderr
