@@ -22,8 +22,17 @@ class Reach(ImagePolicy):
 
     def distribution(self, features_BF: Tensor, states_BS: Tensor) -> DiagonalGaussian:
         aim_B3 = features_BF + self.beside_m * torch.sin(300 * features_BF.roll(1, 1))
-        mean_B3 = ((aim_B3 - states_BS) / STEP_M).clamp(-1, 1)
+        return self.along(aim_B3 - states_BS)
+
+    def along(self, way_B3: Tensor) -> DiagonalGaussian:
+        """The actions that go this way, m, as fast as they may."""
+        mean_B3 = (way_B3 / STEP_M).clamp(-1, 1)
         return DiagonalGaussian(torch.nn.functional.pad(mean_B3, (0, 1)), self.log_std_A.detach())
+
+
+def is_red(images: Tensor) -> Tensor:
+    """(...,) of pictures (..., 3)."""
+    return (images[..., 0] > 90) & (images[..., 1:] < 60).all(-1)
 
 
 def line_of_sight(view: CameraView, down: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
@@ -42,7 +51,7 @@ def reach(config: RunConfig) -> Reach:
         """Where (B, 3) the lines of sight of the red pixels' middles meet; the middle of the view pulls a little."""
         matrix, vector = 0.01 * torch.eye(3), 0.01 * torch.tensor(views[0].lookat_m)
         for view, picture in zip(views, torch.split(images_BHWC.int(), width, 2), strict=True):
-            red = ((picture[..., 0] > 90) & (picture[..., 1:] < 60).all(-1)).float()
+            red = is_red(picture).float()
             rows, columns = torch.arange(height) + 0.5 - height / 2, torch.arange(width) + 0.5 - width / 2
             seen = red.sum((1, 2))
             down, right = ((red * offset).sum((1, 2)) / seen.clamp(min=1) / (FOCAL_HEIGHTS * height)
@@ -73,8 +82,7 @@ class Push(Reach):
         is_stuck = (height_B < 0.48) & (from_block_B2.norm(dim=1) < 0.09) & ~is_there
         across_B2 = torch.where(pushes[:, None], 0.03 * ahead_B2 - 0.5 * aside_B2, behind_B2 * ~is_stuck[:, None])
         up_B = torch.where(pushes | is_there, 0.415, 0.5) - height_B
-        mean_B3 = (torch.cat([across_B2, up_B[:, None]], 1) / STEP_M).clamp(-1, 1)
-        return DiagonalGaussian(torch.nn.functional.pad(mean_B3, (0, 1)), self.log_std_A.detach())
+        return self.along(torch.cat([across_B2, up_B[:, None]], 1))
 
 
 def push(config: RunConfig) -> Push:
@@ -89,10 +97,9 @@ def push(config: RunConfig) -> Push:
     def places(images_BHWC: Tensor) -> Tensor:
         """Middle (B, 4) of the block's dark grey top and of the red spot, on the table; 0 where unseen."""
         low, high = images_BHWC.int().amin(-1), images_BHWC.int().amax(-1)
-        red = (images_BHWC[..., 0] > 90) & (images_BHWC[..., 1:] < 60).all(-1)
         grey = (low > 65) & (high < 82) & (high - low < 4) & on_table
         seen = [torch.where(mask[..., None], grid, torch.nan).flatten(1, 2).nanmedian(1)[0]
-                for mask, grid in ((grey, tops), (red, spots))]
+                for mask, grid in ((grey, tops), (is_red(images_BHWC), spots))]
         return torch.cat(seen, 1).nan_to_num()
 
     return Push(ImageEncoder(places, 4), 3, 4, config.policy, seed=config.seed)
