@@ -30,7 +30,8 @@ EXPERIMENTS = {
     "learning": "video_rl.discs:Learning", "ablations": "video_rl.discs:Ablations",
     "hacking": "video_rl.discs:Hacking", "cost": "video_rl.cost:Cost", "clips": "video_rl.diversity:ClipDiversity",
     "clip-learning": "video_rl.recorded:ClipLearning", "resolution": "video_rl.recorded:Resolution",
-    "outcome": "video_rl.outcome:Outcome", "closed-loop": "video_rl.closed_loop:ClosedLoop",
+    "outcome": "video_rl.outcome:Outcome", "as-written": "video_rl.outcome:AsWritten",
+    "closed-loop": "video_rl.closed_loop:ClosedLoop",
     "erring": "judge.erring:Erring", "success-clips": "judge.success_clips:SuccessClips",
     "tables": "tables.command:Tables",
 }

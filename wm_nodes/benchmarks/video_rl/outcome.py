@@ -21,11 +21,11 @@ from benchmarks.video_rl.comparison import SamplerComparison
 from benchmarks.video_rl.judged import JudgedContexts, open_judge
 from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.proxy_plot import plot_proxy
-from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers
+from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers, paper_samplers
 from benchmarks.video_rl.sources import TASK, config_of
 from benchmarks.video_rl.spread import reward_spread
 from benchmarks.video_rl.trainings import OnIteration, RecordedTrainings, row_name
-from benchmarks.video_rl.trials import SamplerTrial
+from benchmarks.video_rl.trials import PAPER_GROUP, SamplerTrial
 from wm_nodes.apps.options import prepare_torch
 from wm_nodes.config.load import judge_or_embedded, load_config, load_video_config
 from wm_nodes.config.schema import AGENT, EXECUTION
@@ -185,6 +185,22 @@ class Outcome(RecordedTrainings[OutcomePlan]):
                 "execution_success": imagined["execution_success"]}
         shares = done | {f"{name}_executed": some * metrics["executed_success"] for name, some in done.items()}
         return {name: float(values.mean()) for name, values in ({n: metrics[n] for n in METRICS} | shares).items()}
+
+
+@dataclass(kw_only=True)
+class AsWritten(Outcome):
+    """The paper's settings (Table 5) on the outcome task, paid by the action world model: DynDiff beside other samplers
+    at equal model calls, and CPS at equal noise."""
+
+    iterations: Count = 30
+    """Buffers of each training, 16 first frames x 16 clips each."""
+
+    def trials(self) -> list[SamplerTrial[OutcomePlan]]:
+        plan = OutcomePlan(
+            self.iterations, contexts=16, group_size=PAPER_GROUP, eval_contexts=self.eval_contexts, eval_every=5,
+            rewards=((EXECUTION, 1.0),),
+        )
+        return [SamplerTrial(arm, plan) for arm in self.with_rate(paper_samplers())]
 
 
 def paid_trials(sampler: SamplerSetup, plan: OutcomePlan) -> list[SamplerTrial[OutcomePlan]]:

@@ -22,6 +22,12 @@ CLIP_LEARNER = BASE.grpo.with_values(
 clips of few steps, only the weights that carry the condition, no KL."""
 
 
+PAPER_RATE = 1e-3
+"""Learning rate of the paper's settings on the outcome task."""
+QUIET_ETA = 0.18
+"""CPS spends as much noise by it as DynDiff by 0.6 in the paper's settings."""
+
+
 @dataclass(frozen=True)
 class LearningPlan:
     """How long one training is, and how it is measured."""
@@ -162,6 +168,27 @@ def outcome_samplers(preset: str = "outcome") -> list[SamplerSetup]:
     ode = rollout_by(by_arm("ode", 0.0))
     nft = learner.with_values(objective="nft", nft=learner.nft.with_values(times=CLIP_STEPS - 1))
     return [*plain, *windows, SamplerSetup("signed FM, ODE", ode, nft)]
+
+
+def paper_samplers() -> list[SamplerSetup]:
+    """Of Table 5 (preset paper), each on its learner: full likelihood, a clip of 1e-4 at two updates on a buffer, the
+    KL of DD-20, 8 of 16 clips, 55 % of 15 steps, initial noise of their own. CPS at DynDiff's eta, by its authors'
+    weight of the likelihood, too, and at the noise that DynDiff spends; Mix-GRPO is Flow-GRPO in a window.
+
+    The numbers of a network call, of storage and the learning rate are of a small model.
+    """
+    paper = load_video_config("paper")
+    learner = paper.grpo.with_values(learning_rate=PAPER_RATE, micro_batch=128)
+    rollout = paper.rollout.with_values(storage_dtype="float32", buffer_device="model", micro_batch=128)
+    samplers = {
+        "DynDiff 0.6": dyndiff(0.6), "CPS 0.6": by_arm("cps", 0.6), f"CPS {QUIET_ETA}": by_arm("cps", QUIET_ETA),
+        "Flow-GRPO 0.7": by_arm("flow", 0.7), "DanceGRPO 0.3": by_arm("dance", 0.3), "SAGE 0.5": by_arm("sage", 0.5),
+    }
+    setups = [
+        SamplerSetup(name, rollout.with_values(sampler=sampler), learner) for name, sampler in samplers.items()
+    ]
+    weighted = replace(setups[1], name="CPS 0.6, cps", grpo=learner.with_values(logprob_weight="cps"))
+    return [*setups, weighted, replace(_in_window(setups[3]), name="Mix-GRPO 0.7", shared_noise=False)]
 
 
 def _in_window(sampler: SamplerSetup, size: int = 4, period: int = 7) -> SamplerSetup:
