@@ -77,6 +77,7 @@ GROUPS = {
         "benchmark resolution": "a video model on larger pictures than it was trained on",
         "benchmark outcome": "a video model that chooses the motion, by its outcome",
         "benchmark closed-loop": "a video model that goes on from its own frames, with controls",
+        "benchmark public-size": "memory and time of public video models of their real sizes",
         "benchmark erring": "the reward agent under a judge that errs",
         "benchmark success-clips": "any judge on other people's labelled episodes",
         "benchmark tables": "the full tables of the result pages, from the result files",
