@@ -31,7 +31,7 @@ EXPERIMENTS = {
     "hacking": "video_rl.discs:Hacking", "cost": "video_rl.cost:Cost", "clips": "video_rl.diversity:ClipDiversity",
     "clip-learning": "video_rl.recorded:ClipLearning", "resolution": "video_rl.recorded:Resolution",
     "outcome": "video_rl.outcome:Outcome", "as-written": "video_rl.outcome:AsWritten",
-    "closed-loop": "video_rl.closed_loop:ClosedLoop",
+    "closed-loop": "video_rl.closed_loop:ClosedLoop", "public-size": "video_rl.public_size:PublicSize",
     "erring": "judge.erring:Erring", "success-clips": "judge.success_clips:SuccessClips",
     "tables": "tables.command:Tables",
 }
