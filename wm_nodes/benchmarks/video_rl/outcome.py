@@ -23,7 +23,7 @@ from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.proxy_plot import plot_proxy
 from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers, paper_samplers
 from benchmarks.video_rl.sources import TASK, config_of
-from benchmarks.video_rl.spread import reward_spread
+from benchmarks.video_rl.spread import group_spread
 from benchmarks.video_rl.trainings import OnIteration, RecordedTrainings, row_name
 from benchmarks.video_rl.trials import PAPER_GROUP, SamplerTrial
 from wm_nodes.apps.options import prepare_torch
@@ -87,7 +87,7 @@ class OutcomeSource(JudgedContexts):
         self.network, self._heldout = folder.network, heldout
 
     def measure(self, buffer: RolloutBuffer) -> dict[str, float]:
-        return {"rollout_reward_std": reward_spread(buffer)}
+        return group_spread(buffer, self.config.groups.group_size)
 
     def validate(self) -> Mapping[str, list[float]]:
         self.folder.network.eval()

@@ -24,7 +24,7 @@ clips of few steps, only the weights that carry the condition, no KL."""
 
 PAPER_RATE = 1e-3
 """Learning rate of the paper's settings on the outcome task."""
-QUIET_ETA = 0.18
+QUIET_ETA = 0.173
 """CPS spends as much noise by it as DynDiff by 0.6 in the paper's settings."""
 
 
