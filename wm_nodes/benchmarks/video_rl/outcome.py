@@ -161,6 +161,10 @@ class Outcome(RecordedTrainings[OutcomePlan]):
             if self.json is not None:
                 plot_proxy(rows, self.json.with_name(f"{self.json.stem}_proxy.png"))
 
+    def heldout_config(self, seed: int) -> VideoRlConfig:
+        """How the clips of measure_weights are made."""
+        return load_video_config("outcome", {"seed": seed})
+
     def measure_weights(self, weights: Path | None, seed: int) -> dict[str, float]:
         """Return means over the first MEASURED held-out first frames of metrics that were never trained on, of one ODE
         clip each from the noise of `seed`: success by two readers and in the simulator, faults; `accepted`: as a
@@ -171,7 +175,7 @@ class Outcome(RecordedTrainings[OutcomePlan]):
             OSError: no weights are kept.
         """
         heldout, by = _yardstick(self.video_model, self.heldout_bags, self.where)
-        folder, config = self.folder(), load_video_config("outcome", {"seed": seed})
+        folder, config = self.folder(), self.heldout_config(seed)
         if weights is not None:
             load_weights_file(folder.network, weights)
         frames = sample_by_ode(folder, heldout, config, config.evaluation.num_steps)
@@ -201,6 +205,10 @@ class AsWritten(Outcome):
             rewards=((EXECUTION, 1.0),),
         )
         return [SamplerTrial(arm, plan) for arm in self.with_rate(paper_samplers())]
+
+    def heldout_config(self, seed: int) -> VideoRlConfig:
+        trial = self.trials()[0]
+        return config_of(trial.sampler, trial.plan, seed, "outcome", dict(trial.plan.rewards))
 
 
 def paid_trials(sampler: SamplerSetup, plan: OutcomePlan) -> list[SamplerTrial[OutcomePlan]]:
