@@ -324,10 +324,10 @@ class Graph:
     def restart(self, start: Callable[[], Any], book: EndpointTable, *names: str, process: str = "") -> None:
         """Start the killed node names[0] again; return when it and the other names have matched each other.
 
-        A new process may stay deaf under load (3 of some 350 kills on two busy cores): Fast DDS 2.14 gives it the port
-        of the killed one, and a process that was still sending to that port removes its shared memory, by its name
-        (compare https://github.com/eProsima/Fast-DDS/issues/5053). A user would start it again, and so does this, with
-        a warning; only where the memory is gone (as in 2 of these 3), so that no fault of ours is taken for that one.
+        A new process stayed deaf under load in 4 of some 400 kills: it had been given the port of the killed one, which
+        others still wrote to (ros.middleware.dead_ports_held, which they have now, says why). A user would start it
+        again, and so does this, with a warning; only where the new one's shared memory is gone, so that no fault of
+        ours is taken for that one.
 
         Args:
             book: what the probe knows of the links.
@@ -374,6 +374,11 @@ class Graph:
 def thread_names(pid: int) -> list[str]:
     """Of a process, as the system knows them: Fast DDS names its threads by what they serve."""
     return [path.read_text(encoding="utf-8").strip() for path in Path(f"/proc/{pid}/task").glob("*/comm")]
+
+
+def heard_ports(pid: int) -> set[str]:
+    """Shared-memory ports of its domain that a process listens to."""
+    return {name for name in thread_names(pid) if re.fullmatch(r"dds\.shm\.\d{5}", name)}
 
 
 def removed_ports(pid: int) -> list[str]:
