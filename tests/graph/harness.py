@@ -47,7 +47,7 @@ IN_MIDDLEWARE = re.compile(r"Garbage-collecting\n  File \".*/ros/spin\.py\", lin
 deadlock where all leave at once (https://github.com/eProsima/Fast-DDS/issues/6193). Seen once so far;
 ros.runner kills such a node after 10 s."""
 MATCHED_S = 30.0
-"""A restarted node that nobody has matched after this time stays deaf."""
+"""A restarted node that nobody has matched after this time, and whose shared memory is gone, stays deaf."""
 RESEND_S = 8.0
 """A request without an answer is sent once more after this time, for the same reason."""
 
@@ -337,16 +337,18 @@ class Graph:
         for last in (False, True):
             book.forget(names[0], lost=True)
             start()
-            try:
-                wait_until(f"links of {names[0]}", lambda: not book.missing(names), PATIENCE_S if last else MATCHED_S)
+            pid, began_s, removed = self.processes[process].pid, time.monotonic(), list[str]()
+            while (lacking := book.missing(names)) and not removed:
+                time.sleep(0.1)
+                waited_s = time.monotonic() - began_s
+                removed = removed_ports(pid) if waited_s > MATCHED_S else []
+                text = f"{'; '.join(lacking)} after {waited_s:.0f} s; removed shared memory: {removed}"
+                assert waited_s < PATIENCE_S and not (last and removed), text
+            if not lacking:
                 time.sleep(MATCH_S)  # for the probe's clients
                 return
-            except AssertionError:
-                lacking = "; ".join(book.missing(names))
-                removed = removed_ports(self.processes[process].pid)
-                assert removed and not last, f"{lacking}; removed shared memory: {removed}"
-                warnings.warn(f"{names[0]} started once more: {lacking}; {removed} removed", stacklevel=2)
-                self.kill(process)
+            warnings.warn(f"{names[0]} started once more: {text}", stacklevel=2)
+            self.kill(process)
 
     def stop(self) -> dict[str, int]:
         """SIGINT all; after 20 s SIGABRT, which leaves the stack in the log. Return the exit codes; 0, with a warning,
