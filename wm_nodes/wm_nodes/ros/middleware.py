@@ -19,6 +19,8 @@ _USUAL_NODES = 8
 _PORT = re.compile(r"/dev/shm/fastrtps_port(\d+)\b")
 _FIRST_PORT, _PORTS_PER_DOMAIN = 7400, 250
 """Of DDS."""
+_GRAPH_PORTS = range(7000, 7400)
+"""Of rmw_fastrtps: what each node of any domain tells of its topics, from which the others see whom they matched."""
 
 
 def set_node_defaults() -> None:
@@ -44,7 +46,7 @@ def dead_ports_held() -> Iterator[None]:
     """
     first = _FIRST_PORT + _PORTS_PER_DOMAIN * int(os.environ.get("ROS_DOMAIN_ID") or 0)
     with ExitStack() as held:
-        for port in mapped_ports() & {*range(first, first + _PORTS_PER_DOMAIN)}:
+        for port in mapped_ports() & {*_GRAPH_PORTS, *range(first, first + _PORTS_PER_DOMAIN)}:
             lock = Path(f"/dev/shm/fastrtps_port{port}_el")
             with suppress(OSError):
                 new = not lock.exists()
