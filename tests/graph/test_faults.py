@@ -4,15 +4,18 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from graph.harness import Graph, Probe, shm_files, wait_until
+from graph.harness import Graph, Probe, heard_ports, shm_files, wait_until
+from left_over import remove_left_over
 
 from wm_msgs.action import Train
 from wm_msgs.msg import Credit, TransitionBatch
 from wm_nodes.core.errors import WireError
+from wm_nodes.launching.runner import NEW_S
 from wm_nodes.training.weights import save_weights
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
@@ -75,13 +78,35 @@ def test_a_policy_that_is_back_before_it_was_missed_gets_its_rollout_again(graph
     updates: list[Any] = []
     handle = probe.send(probe.action(Train, "train"), Train.Goal(updates=100000), updates.append)
     wait_until("an update", lambda: updates)
+    heard = heard_ports(graph.processes["/wm/policy"].pid)
     graph.kill("/wm/policy")
     count = len(updates)
     graph.restart(graph.start_policy, book, "/wm/policy", "/wm/environment", "/wm/reward_evaluator", "/wm/learner")
     wait_until("an update by the new policy process", lambda: len(updates) > count + 1)
+    new = heard_ports(graph.processes["/wm/policy"].pid)
+    assert heard and new and not heard & new, "a port that the others still write to was taken"
     assert not probe.losses("/wm/learner", "/wm/policy")
     assert "/wm/policy was stopped or restarted" in graph.log("/wm/learner")
     del handle
+
+
+@pytest.mark.kills
+def test_cleaning_takes_a_dead_process_s_memory_and_no_lock_of_a_living_one(graph: Graph, probe: Probe) -> None:
+    def locks(node: str) -> set[Path]:
+        files = Path(f"/proc/{graph.processes[node].pid}/fd").iterdir()
+        return {path for path in map(Path.resolve, files) if path.name.endswith("_el")}
+
+    graph.start_reward()
+    graph.start_policy()
+    for name in ("reward_evaluator", "policy"):
+        wait_until("an active node", lambda n=name: probe.value(f"/wm/{n}", "state") == "active")
+    dead, living = locks("/wm/reward_evaluator"), locks("/wm/policy")
+    time.sleep(NEW_S)
+    graph.kill("/wm/reward_evaluator")
+    remove_left_over()
+    segments = {path for path in dead if "port" not in path.name}
+    assert segments and not any(path.exists() for path in segments)
+    assert living and all(path.exists() for path in living), "a second listener may take the port now"
 
 
 def test_reported_gaps_equal_the_true_gaps_of_a_flood(graph: Graph, probe: Probe) -> None:

@@ -115,7 +115,7 @@ def peer() -> Iterator[Start]:
     yield start
     for each in peers:
         each.close()
-    clean_shared_memory(os.environ)
+    clean_shared_memory()
 
 
 def padded(streams: Streams) -> Streams:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -43,11 +44,11 @@ LOST_S = 12.0
 """A lost peer ends the goal within this time: peer_timeout_s, two heartbeats, a crowded machine."""
 
 
-@pytest.fixture(scope="module")
-def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[VideoLoop]:
+@contextlib.contextmanager
+def running_loop(folder: Path) -> Iterator[VideoLoop]:
     """The running loop after one iteration; seed 2 draws the blind context in the first one."""
     with own_domain() as domain:
-        graph, probe = Graph(domain, tmp_path_factory.mktemp("loop") / "run"), Probe(domain)
+        graph, probe = Graph(domain, folder), Probe(domain)
         try:
             loop = VideoLoop(graph, probe, settings(**{"seed": 2, "grpo.micro_batch": 1}))
             loop.start("video_model", version_timeout_s=1.0)
@@ -59,6 +60,29 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[VideoLoop]:
         finally:
             probe.close()
             graph.stop()
+
+
+@pytest.fixture(scope="module")
+def loops() -> Iterator[tuple[contextlib.ExitStack, list[VideoLoop]]]:
+    """What ends the module's loop, and that loop where one runs."""
+    with contextlib.ExitStack() as stack:
+        yield stack, []
+
+
+@pytest.fixture
+def loop(
+    loops: tuple[contextlib.ExitStack, list[VideoLoop]], request: pytest.FixtureRequest,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[VideoLoop]:
+    """The module's loop. One in which a test failed ends, and the next test starts another."""
+    stack, running = loops
+    if not running:
+        running.append(stack.enter_context(running_loop(tmp_path_factory.mktemp("loop") / "run")))
+    failed = request.session.testsfailed
+    yield running[0]
+    if request.session.testsfailed > failed:
+        running.clear()
+        stack.close()
 
 
 def test_clips_without_reward_are_left_out_and_counted(loop: VideoLoop) -> None:
