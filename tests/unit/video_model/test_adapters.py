@@ -459,10 +459,16 @@ class TestCodec:
             VideoCodec(tiny_vae()).encode(picture().repeat(1, 8, 1, 1, 1))
 
 
-def run_documented(folder: Path, out: Path, device: str, dtype: str) -> dict[str, Any]:
-    """The documented training of a public model, on two contexts; the reward stays where the clips are."""
+def run_documented(folder: Path, out: Path, device: str, dtype: str, text_only: bool = False) -> dict[str, Any]:
+    """The documented training of a public model, on two contexts; the reward stays where the clips are.
+
+    text_only: with the line that the page gives for Wan 2.1.
+    """
     page = (Path(__file__).parents[3] / "wm_nodes" / "docs" / "public_video_models.md").read_text()
     (block,) = re.findall(r"## Training a public model.*?```python\n(.*?)```", page, re.DOTALL)
+    (line,) = re.findall(r"`(contexts = contexts\..*?)`", page)
+    if text_only:
+        block = block.replace("C, _, H, W =", f"{line}\nC, _, H, W =")
     small = {"rollout.num_steps": 4, "groups.group_size": 4, "grpo.advantage.best_of_n": 2}
     scope: dict[str, Any] = {
         "folder": folder, "dtype": dtype, "device": device, "frames": torch.cat([picture(), picture(1)]),
@@ -508,14 +514,25 @@ class TestFolder:
         assert main(["check-video-model", "--public", str(tmp_path), *small]) == 2
         assert str(tmp_path) in capsys.readouterr().err
 
-    def test_the_documented_training_runs_as_written_and_its_adapter_loads(self, folder: Path, tmp_path: Path) -> None:
+    def test_the_documented_training_runs_as_written_and_its_adapter_loads(
+        self, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
         scope = run_documented(folder, tmp_path, "cpu", "bfloat16")
+        printed = r"\d [\d.]+ \[.+, .+\] \d+ s, 0\.0 GiB"
+        assert all(re.fullmatch(printed, line) for line in capsys.readouterr().out.splitlines()[-2:])
         assert scope["report"].kept == 4 and scope["learner"].version == 4
         trained = {name: p for name, p in scope["public"].velocity.named_parameters() if "lora_B" in name}
         (file,) = tmp_path.glob("*.safetensors")
         adapter = {f"transformer.{name}": p for name, p in load_file(file).items()}
         assert trained and all(torch.equal(adapter[name.replace(".default", "")], p) for name, p in trained.items())
         assert any(float(p.detach().abs().max()) > 0 for p in trained.values()), "it starts as zeros"
+
+    def test_wan_text_to_video_refuses_the_first_frames_and_trains_without_them(self, tmp_path: Path) -> None:
+        wan_pipeline(scheduler=unipc()).save_pretrained(tmp_path / "t2v", safe_serialization=True)
+        with pytest.raises(ValueError, match=r"text alone and takes no given frames, got 1; .*without_frames\(\)"):
+            run_documented(tmp_path / "t2v", tmp_path, "cpu", "float32")
+        scope = run_documented(tmp_path / "t2v", tmp_path, "cpu", "float32", text_only=True)
+        assert scope["learner"].version == 4 and scope["clips"].condition.num_conditioning == 0
 
     def test_bfloat16_and_checkpointing(self, folder: Path) -> None:
         loaded = load_public_model(folder, dtype="bfloat16", gradient_checkpointing=True, max_tokens=12)

@@ -116,7 +116,7 @@ class PublicSize(OnDevice):
             frames = self.frames or SIZES[name].frames
             if any((row["model"], row["frames"], row["steps"]) == (name, frames, self.steps) for row in rows):
                 continue
-            row = {"model": name, "frames": frames, "steps": self.steps}
+            row: dict[str, Any] = {"model": name, "frames": frames, "steps": self.steps}
             try:
                 row |= measure_size(SIZES[name], frames, self.steps, self.seed, self.where)
             except Exception as error:  # the other models are worth more than an early end

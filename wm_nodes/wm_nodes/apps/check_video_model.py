@@ -6,7 +6,6 @@ little of the gap to the codec, no group method can learn.
 """
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -128,7 +127,7 @@ def _public(arguments: argparse.Namespace, config: VideoRlConfig, device: str) -
     C, F, H, W = public.codec.encode(frames).shape[1:]
     condition = public.condition(frames[:, :1], [arguments.prompt], F).repeat_interleave(VIDEOS)
     if arguments.text_only:
-        condition = replace(condition, frames=condition.frames[:, :, :0])
+        condition = condition.without_frames()
     model: Any = public.velocity
     if arguments.lora_rank:
         add_lora(model, arguments.lora_rank, 2 * arguments.lora_rank)

@@ -37,6 +37,9 @@ class Condition:
     def without_actions(self) -> "Condition":
         return Condition(self.frames, self.actions[:, :, :0], self.text)
 
+    def without_frames(self) -> "Condition":
+        return Condition(self.frames[:, :, :0], self.actions, self.text)
+
     def repeat_interleave(self, times: int) -> "Condition":
         """Each row `times` times, in groups."""
         return Condition(*(tensor.repeat_interleave(times, 0) for tensor in (self.frames, self.actions, self.text)))

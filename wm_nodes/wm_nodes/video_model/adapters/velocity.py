@@ -57,7 +57,9 @@ class PublicVelocity(nn.Module, ABC):
             )
         K, dtype = condition.num_conditioning, self.dtype
         if K and self.no_frames:
-            raise ValueError(f"this model {self.no_frames} and takes no given frames, got {K}")
+            raise ValueError(
+                f"this model {self.no_frames} and takes no given frames, got {K}; give it Condition.without_frames()"
+            )
         times_BF = t.to(x.device, torch.float64).view(-1, 1).repeat(1, x.shape[2])
         times_BF[:, :K] = self.clean_time
         text = self._text(condition, drop).to(dtype)
