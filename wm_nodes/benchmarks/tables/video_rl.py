@@ -95,6 +95,15 @@ def cost() -> Rows:
         yield model, same[0]["anchor"], percent(median(shares)), mebibytes, f"{100 * masked:.2f}"
 
 
+def public_sizes() -> Rows:
+    keys = ("rollout_gib", "rollout_s_per_step_clip", "train_gib", "train_s_per_transition", "computed_iteration_h")
+    for one in read("public_size.json")["rows"]:
+        anchor_h = one["computed_train_h"] * one["rollout_s_per_step_clip"] / one["train_s_per_transition"]
+        hours = one["computed_iteration_h"] + anchor_h
+        numbers = (f"{value:.3g}" for value in (*(one[key] for key in keys), hours))
+        yield one["model"], one["frames"], f"{one['parameters'] / 1e9:.2f}", one["tokens"], *numbers
+
+
 def ablations() -> Rows:
     for one in read(ABLATIONS)["comparisons"]:
         yield pair(one), *compared(one, [("reward", 3), ("obeyed", 2), ("background", 4)])
