@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from benchmarks.video_rl.outcome import METRICS
+from benchmarks.video_rl.outcome import METRICS, AsWritten
 from wm_nodes.apps.cli import main
-from wm_nodes.config.load import load_config
+from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.config.seed_ranges import HELDOUT
 from wm_nodes.environments.record import collect_plan, scripted_plan
 
@@ -51,3 +51,18 @@ def test_the_command_trains_measures_the_kept_weights_and_goes_on_where_its_file
     assert main([*call[:-len(ARMS)], ARMS[0], "--seeds", "0", "1"]) == 0
     rows = rows_of(path)
     assert rows[:4] == first and [(row["sampler"], row["seed"]) for row in rows[4:]] == [(ARMS[0], 1)]
+
+
+def test_as_written_is_the_preset_of_the_paper_but_for_what_a_small_model_needs() -> None:
+    paper = load_video_config("paper")
+    mix, small = {"step_fraction"}, {"learning_rate", "micro_batch"}
+    for trial in AsWritten(context_bags=(), heldout_bags=()).trials():
+        sampler, plan = trial.sampler, trial.plan
+        changed = small | (mix if sampler.name.startswith("Mix") else set())
+        changed |= {"logprob_weight"} if sampler.name.endswith(", cps") else set()
+        assert sampler.grpo.model_dump(exclude=changed) == paper.grpo.model_dump(exclude=changed), sampler.name
+        kept = {"num_steps", "shift", "cfg"}
+        assert sampler.rollout.model_dump(include=kept) == paper.rollout.model_dump(include=kept), sampler.name
+        assert (plan.contexts, plan.group_size) == (paper.groups.contexts, paper.groups.group_size)
+        assert sampler.shared_noise == paper.groups.shared_noise
+    assert AsWritten(context_bags=(), heldout_bags=()).trials()[0].sampler.rollout.sampler == paper.rollout.sampler
