@@ -9,9 +9,11 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
+import yaml
 
 from benchmarks.experiment import EXPERIMENTS
 from wm_nodes.apps import cli
+from wm_nodes.config.load import load_config
 from wm_nodes.core.errors import ModelNotAcceptedError, RunError
 from wm_nodes.reports.live_page import LivePage
 
@@ -98,6 +100,15 @@ def test_an_error_is_one_line_and_code_2(words: list[str], said: str, capsys: py
     assert cli.main(words) == 2
     text = capsys.readouterr().err
     assert text.startswith("error: ") and text.count("\n") == 1 and said in text
+
+
+@pytest.mark.parametrize("words", [["follow-clips", "--out", "bag"], ["retrain"]])
+def test_what_takes_a_run_of_a_video_model_says_so_of_another_run(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(load_config("smoke").model_dump()), encoding="utf-8")
+    assert cli.main([words[0], str(tmp_path), *words[1:]]) == 2
+    assert f"{tmp_path} is no run of a video model; name the run" in capsys.readouterr().err
 
 
 def test_a_page_that_cannot_be_opened_is_one_line_before_anything_begins(

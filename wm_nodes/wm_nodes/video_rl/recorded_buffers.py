@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wm_nodes.config.load import load_video_config
+from wm_nodes.config.load import load_video_config, read_yaml
 from wm_nodes.config.schema import AGENT
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.types import UInt8Array
@@ -99,12 +99,14 @@ def read_run(run_dir: Path, overrides: dict[str, Any] | None = None) -> tuple[Pa
     """Return the full path of a run folder, and its settings with some overridden.
 
     Raises:
-        ValueError: it holds no settings.
+        ValueError: it holds no settings, or those of another kind of run.
     """
     folder = run_dir.expanduser().absolute()
     saved = folder / "config.yaml"
     if not saved.is_file():
         raise ValueError(f"{folder} holds no config.yaml; name the run folder of a train-video-model, or a bag")
+    if "grpo" not in read_yaml(saved):
+        raise ValueError(f"{folder} is no run of a video model; name the run folder of a train-video-model")
     return folder, load_video_config(str(saved), overrides)
 
 
