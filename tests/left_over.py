@@ -6,7 +6,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from wm_nodes.launching.runner import clean_shared_memory
-from wm_nodes.ros.middleware import mapped_ports
+
+PORT = re.compile(r"/dev/shm/fastrtps_port(\d+)\b")
+LOCKS = ("_el", "_sl")
 
 
 def remove_left_over(*, ports: bool = True) -> None:
@@ -27,9 +29,6 @@ def remove_left_over(*, ports: bool = True) -> None:
                     path.unlink()
 
 
-LOCKS = ("_el", "_sl")
-
-
 def _locked(path: Path) -> bool:
     try:
         with path.open("rb") as file:
@@ -39,3 +38,12 @@ def _locked(path: Path) -> bool:
     except OSError:
         return True
     return False
+
+
+def mapped_ports() -> set[int]:
+    """Fast DDS ports whose shared memory some process has mapped, even under a name that is gone."""
+    ports = set[int]()
+    for maps in Path("/proc").glob("[0-9]*/maps"):
+        with suppress(OSError):
+            ports.update(map(int, PORT.findall(maps.read_text(encoding="utf-8", errors="replace"))))
+    return ports

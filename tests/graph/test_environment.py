@@ -157,8 +157,7 @@ def test_a_late_joiner_gets_the_latched_spec_and_goal(client: Client) -> None:
 
 def test_a_stopped_environment_ends_its_episodes_as_deactivated(client: Client, graph: Graph) -> None:
     events = client.probe.listen("episode")
-    wait_until("matching", lambda: client.probe.node.count_publishers("/wm/episode"))
-    client.reset()
+    wait_until("an event: the probe sees a publisher before that sees it", lambda: (client.reset(), events)[1])
     assert graph.stop() == {"/wm/environment": 0}
     wait_until(
         "ends", lambda: sum(e.termination_reason == EpisodeEvent.REASON_DEACTIVATED for e in events) == N, timeout_s=5

@@ -8,7 +8,8 @@ from benchmarks.tables.video_rl import gained, over_seeds, samplers
 from benchmarks.video_rl.comparison import compare_samplers
 
 OUTCOME, EARLY, JUDGED = (f"video_rl_outcome{of}.json" for of in ("", "_early", "_judge"))
-EXECUTED = "video_rl_outcome_execution.json"
+EXECUTED, MIXED = "video_rl_outcome_execution.json", "video_rl_outcome_mixed.json"
+AFTER = "measured_after"
 CLOSED_LOOP, ENVIRONMENTS = "video_rl_closed_loop.jsonl", "environments.jsonl"
 PROBE_PAID, JUDGE_PAID = "CPS 0.4", "CPS 0.4, judge robot"
 CHANGES = (("error_cm", 2), ("object_cm", 2), ("tool_cm", 2), ("psnr_db", 2))
@@ -67,21 +68,21 @@ def executed() -> Rows:
 
 
 def execution_paid() -> Rows:
-    paid = read(EXECUTED)["rows"]
+    paid, mixed = (read(file)["rows"] for file in (EXECUTED, MIXED))
     probe = {one["seed"]: one["measured_after"] for one in read(OUTCOME)["rows"] if one["sampler"] == PROBE_PAID}
-    probes = [probe[one["seed"]] for one in paid]
-    for name, after in (
-        ("action world model, 15 buffers", [one["measured_15"] for one in paid]),
-        ("action world model, 20 buffers", [one["measured_after"] for one in paid]), ("probe, 15 buffers", probes),
+    for name, trained, when in (
+        ("action world model, 15 buffers", paid, "measured_15"), ("action world model, 20 buffers", paid, AFTER),
+        ("and 0.3 of the outcome, 20 buffers", mixed, AFTER), ("probe, 15 buffers", paid, ""),
     ):
+        probes = [probe[one["seed"]] for one in trained]
+        after = [one[when] for one in trained] if when else probes
         real = [one["executed_success"] for one in after]
-        gains = [now - one["measured_before"]["executed_success"] for now, one in zip(real, paid, strict=True)]
+        gains = [now - one["measured_before"]["executed_success"] for now, one in zip(real, trained, strict=True)]
         apart = [now - one["executed_success"] for now, one in zip(real, probes, strict=True)]
         kinds = [mean(one.get(kind, math.nan) for one in after) for kind in ("success", "execution_success")]
         yield (
             name, ", ".join(f"{value:.2f}" for value in real), f"{mean(real):.3f}", over_seeds(gains, 3),
-            "" if after is probes else over_seeds(apart, 3),
-            *(f"{kind:.3f}" if math.isfinite(kind) else "" for kind in kinds),
+            over_seeds(apart, 3) if when else "", *(f"{kind:.3f}" if math.isfinite(kind) else "" for kind in kinds),
             f"{mean(one['executed_object_cm'] for one in after):.1f}",
         )
 

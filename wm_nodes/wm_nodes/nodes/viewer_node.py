@@ -24,7 +24,7 @@ from wm_nodes.nodes.viewer.feed import PER_STEP, TABLE_S, TYPES, VIEW, Feed
 from wm_nodes.nodes.viewer.run_folder import RunFolder
 from wm_nodes.recording import topics
 from wm_nodes.reports.live_page import LivePage
-from wm_nodes.ros.middleware import dead_ports_held, set_node_defaults
+from wm_nodes.ros.middleware import set_node_defaults
 from wm_nodes.ros.params import COMMON, Param, declare
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.spin import destroy, executor_kind, init, make_executor, spin, stop_on_signals
@@ -102,8 +102,7 @@ def main() -> int:
     try:
         init()
         with stop_on_signals() as stopped:
-            with dead_ports_held():
-                node = ViewerNode()
+            node = ViewerNode()
             executor = make_executor(executor_kind(node))
             executor.add_node(node)
             spin(executor, stopped)

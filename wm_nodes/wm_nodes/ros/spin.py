@@ -24,7 +24,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from wm_nodes.config.load import ConfigError, read_yaml
 from wm_nodes.core.memory import keep_freed_memory, limit_memory
-from wm_nodes.ros.middleware import dead_ports_held, set_node_defaults
+from wm_nodes.ros.middleware import set_node_defaults
 
 EXECUTORS = ("events", "single", "multi")
 SPIN_ONCE_S = 0.1
@@ -216,8 +216,7 @@ def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = 
     try:
         init(args)
         with stop_on_signals() as stopped:
-            with dead_ports_held():
-                nodes = list(make_nodes())
+            nodes = list(make_nodes())
             _limit_memory(nodes)
             executor = make_executor(executor_kind(nodes[0]))
             for node in nodes:
