@@ -5,9 +5,10 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
+from graph.shm_maps import mapped, processes
+
 from wm_nodes.launching.runner import clean_shared_memory
 
-PORT = re.compile(r"/dev/shm/fastrtps_port(\d+)\b")
 LOCKS = ("_el", "_sl")
 
 
@@ -20,10 +21,10 @@ def remove_left_over(*, ports: bool = True) -> None:
     if not ports:
         return
     found = [path for path in Path("/dev/shm").glob("fastrtps_port*") if re.fullmatch(r"fastrtps_port\d+", path.name)]
-    in_use = mapped_ports()
+    in_use = set[str]().union(*map(mapped, processes()))
     for port in found:
         files = [port, port.with_name(f"sem.{port.name}_mutex"), *(port.with_name(port.name + end) for end in LOCKS)]
-        if int(port.name.removeprefix("fastrtps_port")) not in in_use and not any(map(_locked, files[2:])):
+        if str(port) not in in_use and not any(map(_locked, files[2:])):
             for path in files:
                 with suppress(OSError):
                     path.unlink()
@@ -38,12 +39,3 @@ def _locked(path: Path) -> bool:
     except OSError:
         return True
     return False
-
-
-def mapped_ports() -> set[int]:
-    """Fast DDS ports whose shared memory some process has mapped, even under a name that is gone."""
-    ports = set[int]()
-    for maps in Path("/proc").glob("[0-9]*/maps"):
-        with suppress(OSError):
-            ports.update(map(int, PORT.findall(maps.read_text(encoding="utf-8", errors="replace"))))
-    return ports
