@@ -13,7 +13,7 @@ SIDE_PX = 40
 class DrawnPendulum(PendulumEnv):
     def step(self, u: NDArray[np.float32]) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observed, reward, terminated, truncated, _ = super().step(u)
-        return observed, reward, terminated, truncated, {"upright": observed[0] > 0.5}
+        return observed, reward, terminated, truncated, {"upright": observed[0] > 0.5, "height": observed[0]}
 
     def render(self) -> NDArray[np.uint8]:
         image = np.full((SIDE_PX, SIDE_PX, 3), (30, 40, 60), np.uint8)

@@ -26,6 +26,7 @@ EXPERIMENTS = {
     "speed": "speed.speed:Speed", "device-speed": "speed.device:DeviceSpeed",
     "view": "speed.view:View",
     "trained-in": "environments.experiments:TrainedIn", "ranking": "environments.experiments:Ranking",
+    "policy": "environments.experiments:Measured",
     "disc-base": "video_rl.discs:DiscBase", "diversity": "video_rl.diversity:DiscDiversity",
     "learning": "video_rl.discs:Learning", "ablations": "video_rl.discs:Ablations",
     "hacking": "video_rl.discs:Hacking", "cost": "video_rl.cost:Cost", "clips": "video_rl.diversity:ClipDiversity",

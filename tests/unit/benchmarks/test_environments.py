@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drawn_pendulum import SETTINGS
 from model_folders import make_model_folder, make_stepped_folder, write_starts
 
 from benchmarks.environments.experiments import is_finished
@@ -21,7 +22,7 @@ from benchmarks.environments.policies import (
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
 from wm_nodes.core.files import file_sha256
-from wm_nodes.policy_rl.factories import make_policy
+from wm_nodes.policy_rl.factories import UNTRAINED, make_policy
 from wm_nodes.policy_rl.initial_policy import start_files
 from wm_nodes.training.weights import save_weights
 
@@ -127,3 +128,19 @@ def test_trained_in_prints_acceptance_keeps_refused_rows_and_trains_again_only_b
     assert rates == [row["config"]["ppo"]["learning_rate"], 1e-5]
     assert main([*words, "--sft.num_demonstrations", "3"]) == 2
     assert "were made with sft.num_demonstrations 4, not 3; take another folder" in capsys.readouterr().err
+
+
+def test_a_policy_is_measured_in_an_environment_of_ones_own_with_what_that_measures_beside_success(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "rows.json"
+    settings = {**SETTINGS, "evaluation.environment": "gymnasium", "evaluation.episodes": 5,
+                "gymnasium.measures": ["height"], "policy.factory": UNTRAINED}
+    words = ["benchmark", "policy", "--preset", "smoke", "--json", str(file),
+             *(word for name, value in settings.items() if name != "task" for word in (f"--{name}", json.dumps(value)))]
+    assert main(words) == 0
+    shown, (row,) = capsys.readouterr().out, json.loads(file.read_text(encoding="utf-8"))["rows"]
+    mean, low, high = row["measures"]["height"]
+    assert (row["policy"], row["episodes"]) == (UNTRAINED, 5) and -1 <= low <= mean <= high <= 1
+    assert f"{row['successes']} of 5" in shown and f"{mean:.3f}" in shown
+    assert main(words) == 0 and json.loads(file.read_text(encoding="utf-8"))["rows"] == [row]

@@ -11,10 +11,13 @@ import torch
 from drawn_pendulum import SETTINGS
 from gymnasium import spaces
 
-from examples import fetch_controller
+from examples import fetch_controller, push_t_controller
 from wm_nodes.config.load import ConfigError, load_config
 from wm_nodes.core.types import Environment
+from wm_nodes.environments.batch import EnvironmentBatch
 from wm_nodes.environments.registry import configured_spec, make_environment
+from wm_nodes.policy_rl.factories import untrained_policy
+from wm_nodes.policy_rl.validation.evaluation import evaluate
 
 
 class Seesaw(gymnasium.Env[dict[str, Any], np.ndarray]):
@@ -30,7 +33,8 @@ class Seesaw(gymnasium.Env[dict[str, Any], np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         self.taken = action
-        return self._shown(action[0] / 4), 0.0, bool(action[1] < -1), False, {"level": action[1] > 1}
+        info = {"level": action[1] > 1, "height": action[0]}
+        return self._shown(action[0] / 4), 0.0, bool(action[1] < -1), False, info
 
     def _shown(self, angle: float) -> dict[str, Any]:
         camera = np.full((8, 12, 3), 200, np.uint8)
@@ -75,6 +79,19 @@ def test_success_is_what_info_says_and_a_fall_truncates() -> None:
     result = environment.step(np.array([[0, 0.9], [0, -0.9]], np.float32))
     assert result.terminated.tolist() == [True, False] and result.truncated.tolist() == [False, True]
     assert result.success_probability.tolist() == [1.0, 0.0]
+
+
+def test_numbers_of_info_are_its_ground_truth_and_an_evaluation_gives_the_largest_of_each_episode() -> None:
+    environment = made({**SEESAW, "gymnasium.measures": ["height"]})
+    assert environment.spec.ground_truth_names == ("height",)
+    environment.reset()
+    assert isinstance(environment, EnvironmentBatch) and np.isnan(environment.ground_truth).all()  # until a step says
+    result = environment.step(np.array([[0.5, 0], [-1, 0]], np.float32))
+    np.testing.assert_allclose(result.ground_truth, [[3.0], [0.0]])
+    policy = untrained_policy(load_config("smoke", SEESAW))
+    with torch.no_grad():
+        played = evaluate(policy, environment, 3, 1, deterministic=False)
+    assert played.largest.shape == (3, 1) and (np.ptp(played.largest) > 0) and (played.largest >= 0).all()
 
 
 def test_a_seed_decides_an_episode_in_whichever_copy() -> None:
@@ -155,6 +172,13 @@ def test_push_t_shows_its_two_shapes_and_an_action_says_where_the_pusher_goes() 
     assert not result.terminated.any() and environment.spec.max_episode_steps == 300
 
 
+def test_the_controller_of_push_t_covers_the_spot() -> None:
+    pytest.importorskip("gym_pusht", reason="PushT needs what requirements/gym.txt says")
+    environment, policy = made({}, preset="push_t"), push_t_controller.push(load_config("push_t"))
+    played = evaluate(policy, environment, 2, 1_500_000)
+    assert (played.largest[:, 0] > 0.7).all() and (played.largest[:, 0] > 0.95).tolist() == played.success.tolist()
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -167,12 +191,18 @@ def test_push_t_shows_its_two_shapes_and_an_action_says_where_the_pusher_goes() 
         ({"gymnasium.pixels": "cameras"}, "pixels is cameras, and cameras names none"),
         ({"gymnasium.pixels": "cameras", "gymnasium.cameras": VIEW}, "needs an environment of MuJoCo, not Seesaw"),
         ({"gymnasium.action_scale": 2.0}, "gymnasium.action_scale: .* less than or equal to 1"),
+        ({"gymnasium.measures": ["depth"]}, r"measures names \['depth'\], and info has \['height', 'level'\]"),
         ({"environment.factory": "mujoco"}, "no environment 'mujoco'; choose one of maniskill, gymnasium"),
     ],
 )
 def test_what_does_not_fit_is_refused_by_value_and_remedy(changes: dict[str, Any], words: str) -> None:
+    def use() -> None:
+        environment = made({**SEESAW, **changes})
+        environment.reset()
+        environment.step(np.zeros((2, 2), np.float32))
+
     with pytest.raises(ValueError, match=words):
-        made({**SEESAW, **changes}).reset()
+        use()
 
 
 def test_a_factory_of_a_wrong_form_is_refused_with_the_settings() -> None:

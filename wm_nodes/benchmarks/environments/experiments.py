@@ -4,12 +4,14 @@ ranks policies.
 
 import argparse
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from benchmarks.environments.policies import (
     SIMULATOR,
+    SIMULATOR_ENVS,
     WORLD_MODEL,
     Workplace,
     measure_policy,
@@ -20,10 +22,16 @@ from benchmarks.experiment import Experiment, console
 from wm_nodes.apps import options
 from wm_nodes.config.load import load_config
 from wm_nodes.config.scenes import check_scenes
+from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.device import compute_device
 from wm_nodes.core.progress import tqdm
+from wm_nodes.core.statistics import bootstrap_mean
+from wm_nodes.environments.registry import make_environment
+from wm_nodes.policy_rl.factories import make_policy
+from wm_nodes.policy_rl.validation.evaluation import evaluate
 from wm_nodes.reports.console_table import make_table
+from wm_nodes.training.weights import load_weights_file
 
 
 @dataclass(kw_only=True)
@@ -117,6 +125,65 @@ class Ranking(InModels):
             [(model, f"{one['correlation']:+.2f}", f"{one['low']:+.2f} to {one['high']:+.2f}")
              for model, one in correlations.items()],
         ))
+
+
+@dataclass(kw_only=True)
+class Measured(Experiment):
+    """Measure a policy in evaluation.environment: success, and of each of gymnasium.measures the largest in an episode.
+    """
+
+    preset: str
+    """Of the settings: a name, or a .yaml."""
+    task: str = ""
+    """Of the environment; empty for one of your own."""
+    model_dir: Path | None = None
+    """World model whose tokenizer the policy sees by; without, policy.factory makes it."""
+    weights: Path | None = None
+    """The policy's; without, as it is made."""
+
+    @classmethod
+    def add_settings(cls, parser: argparse.ArgumentParser) -> None:
+        options.add_settings(parser)
+        options.add_device(parser)
+
+    @classmethod
+    def settings_of(cls, arguments: argparse.Namespace) -> dict[str, Any]:
+        return options.settings(arguments)
+
+    def run(self) -> None:
+        config, rows = load_config(self.preset, {"task": self.task, **self.settings}), self.read()
+        policy = str(self.weights or config.policy.factory or "untrained")
+        wanted = {"policy": policy, "config": config.model_dump(mode="json")}
+        if not is_finished(rows, wanted):
+            rows.append({**wanted, **self._measured(config)})
+            self.write({"rows": rows}, device=config.device)
+        columns = ("policy", "successes", "95 %", *(f"{name}, largest" for name in config.gymnasium.measures))
+        console.print(make_table(f"{config.gymnasium.env_id}: a policy in {config.evaluation.environment}", columns, [
+            (row["policy"], f"{row['successes']} of {row['episodes']}", f"{row['low']:.3f} to {row['high']:.3f}",
+             *("{:.3f} ({:.3f} to {:.3f})".format(*row["measures"][name]) for name in config.gymnasium.measures))
+            for row in rows
+        ]))
+
+    def _measured(self, config: RunConfig) -> dict[str, Any]:
+        how, policy = config.evaluation, make_policy(config, self.model_dir)
+        if self.weights:
+            load_weights_file(policy, self.weights)
+        with (
+            closing(make_environment(config, how.environment, num_envs=SIMULATOR_ENVS, seed=config.seed)) as env,
+            tqdm(total=how.episodes, desc="episodes", unit="episode") as bar,
+        ):
+            def show(done: int, _: int) -> None:
+                bar.update(done - bar.n)
+
+            found = evaluate(policy, env, how.episodes, how.first_seed, how.deterministic, on_progress=show)
+        return {
+            "successes": found.successes, "episodes": found.episodes, "low": found.low, "high": found.high,
+            "mean_length": found.mean_length, "measures": {
+                name: bootstrap_mean(values, seed=config.seed)
+                for name, values in zip(env.spec.ground_truth_names, found.largest.T)
+                if name in config.gymnasium.measures
+            },
+        }
 
 
 def is_finished(rows: Sequence[Mapping[str, Any]], wanted: Mapping[str, Any]) -> bool:

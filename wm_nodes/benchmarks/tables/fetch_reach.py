@@ -1,7 +1,7 @@
 """Rows of the tables of docs/results/fetch_reach.md; what they are about stands in pages.yaml."""
 
 from benchmarks.tables.own_data import FILE
-from benchmarks.tables.table import Rows, Run, lines, points, share
+from benchmarks.tables.table import Rows, Run, lines, points, read, share
 
 
 def beside_control() -> Rows:
@@ -13,6 +13,13 @@ def beside_control() -> Rows:
         its = [run for run in made if run["run"].startswith(name)]
         if len(its) > 1:
             yield _beside_control(f"{name}, {len(its)} seeds", its)
+
+
+def push_t() -> Rows:
+    for run in read("push_t.json")["rows"]:
+        mean, low, high = run["measures"]["coverage"]
+        yield (run["policy"].rpartition(":")[2], share(run["successes"], run["episodes"]),
+               f"{mean:.3f} [{low:.3f}, {high:.3f}]", f"{run['mean_length']:.0f}")
 
 
 def _beside_control(name: str, its: list[Run]) -> tuple[str, ...]:

@@ -197,12 +197,14 @@ class AsWritten(Outcome):
     at equal model calls, and CPS at equal noise."""
 
     iterations: Count = 30
-    """Buffers of each training, 16 first frames x 16 clips each."""
+    """Buffers of each training."""
+    contexts: Count = 16
+    """First frames of a buffer, 16 clips of each."""
 
     def trials(self) -> list[SamplerTrial[OutcomePlan]]:
         plan = OutcomePlan(
-            self.iterations, contexts=16, group_size=PAPER_GROUP, eval_contexts=self.eval_contexts, eval_every=5,
-            rewards=((EXECUTION, 1.0),),
+            self.iterations, contexts=self.contexts, group_size=PAPER_GROUP, eval_contexts=self.eval_contexts,
+            eval_every=5, rewards=((EXECUTION, 1.0),),
         )
         return [SamplerTrial(arm, plan) for arm in self.with_rate(paper_samplers())]
 

@@ -66,6 +66,7 @@ GROUPS = {
         "benchmark view": "CPU time that the live page costs the other nodes",
         "benchmark trained-in": "policies trained in each model, measured in the simulator",
         "benchmark ranking": "imagined success of policies against their real success",
+        "benchmark policy": "success of a policy in an environment of your own, and what that measures beside it",
         "benchmark disc-base": "the video model that experiments on the moving disc begin with",
         "benchmark diversity": "diversity on the moving disc, at equal quality and noise budget",
         "benchmark learning": "reward against model calls, every sampler on one learner",

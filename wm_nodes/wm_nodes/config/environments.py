@@ -51,6 +51,8 @@ class GymnasiumConfig(SettingsSection):
     mapping."""
     success: str
     """Key of info that says that the task is done; empty: the environment's `terminated` does."""
+    measures: list[str]
+    """Keys of info whose numbers are published and recorded beside success, as ground truth."""
     instruction: str
     """What the episodes are for, in words."""
 

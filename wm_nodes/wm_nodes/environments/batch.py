@@ -24,6 +24,8 @@ class Frame(NamedTuple):
     """Whether the task is done, which terminates the episode."""
     over: bool = False
     """Whether the episode cannot go on without success: it counts as truncated."""
+    truth: Sequence[float] = ()
+    """The spec's ground truth; NaN for what is unknown."""
 
 
 class SingleEnvironment(Protocol):
@@ -45,18 +47,17 @@ class EnvironmentBatch:
     so, and after spec.max_episode_steps.
 
     Args:
-        spec: of one of them; without ground truth.
+        spec: of one of them.
         seed: root seed of resets without a given seed.
     """
 
     def __init__(self, spec: EnvironmentSpec, copies: Sequence[SingleEnvironment], seed: int) -> None:
-        if spec.ground_truth_names:
-            raise ValueError(f"copies say no ground truth, the spec names {spec.ground_truth_names}; leave it empty")
         count = len(copies)
         self.spec = replace(spec, num_envs=count)
         self._copies, self._seed, self._resets = copies, seed, 0
         self._images = np.zeros((count, spec.height, spec.width, 3), np.uint8)
         self._states = np.zeros((count, spec.state_dim), np.float32)
+        self.ground_truth = np.full((count, spec.ground_truth_dim), np.nan, np.float32)
         self._ids, self._steps = np.zeros(count, np.uint64), np.zeros(count, np.uint32)
         self._ended = np.ones(count, bool)
 
@@ -81,7 +82,7 @@ class EnvironmentBatch:
         count = len(self._copies)
         return StepResult(
             self._observation(), success, truncated, success.astype(np.float32), np.zeros(count, np.float32),
-            np.zeros((count, 0), np.float32), valid,
+            self.ground_truth.copy(), valid,
         )
 
     def goals(self) -> tuple[UInt8Array, BoolArray] | None:
@@ -92,9 +93,12 @@ class EnvironmentBatch:
             copy.close()
 
     def _show(self, env: int, frame: Frame) -> None:
-        for name, value, kept in (("image", frame.image, self._images[env]), ("state", frame.state, self._states[env])):
+        for name, value, kept in (
+            ("image", frame.image, self._images[env]), ("state", frame.state, self._states[env]),
+            ("truth", frame.truth, self.ground_truth[env]),
+        ):
             if (shape := np.shape(value)) != kept.shape:
-                raise ValueError(f"{self.spec.env_id} shows an {name} of shape {shape}, and its spec says {kept.shape}")
+                raise ValueError(f"{self.spec.env_id} shows {name} of shape {shape}, and its spec says {kept.shape}")
             kept[...] = value
 
     def _observation(self) -> Observation:

@@ -61,30 +61,33 @@ class GymnasiumCopy:
             source=SOURCE_SIMULATOR, num_envs=1, height=height, width=width * len(cameras), cameras=cameras,
             action_names=tuple(f"action.{i}" for i in range(len(self._half))), action_units=("1",) * len(self._half),
             action_scale=tuple(map(float, self._half)), state_names=tuple(states), state_units=("1",) * len(states),
-            ground_truth_names=(), control_period_s=1 / float(self._env.metadata.get("render_fps") or 10),
-            max_episode_steps=limit,
+            ground_truth_names=tuple(config.measures), max_episode_steps=limit,
+            control_period_s=1 / float(self._env.metadata.get("render_fps") or 10),
         )
 
     def reset(self, seed: int) -> Frame:
-        return self._frame(self._env.reset(seed=seed % 2**31)[0])
+        return self._frame(*self._env.reset(seed=seed % 2**31))
 
     def step(self, action: FloatArray) -> Frame:
         taken = (self._middle + self._half * action).astype(self._env.action_space.dtype)
         observed, _, terminated, truncated, info = self._env.step(taken)
         success = bool(info.get(self._config.success)) if self._config.success else bool(terminated)
-        return self._frame(observed, success, bool(terminated or truncated))
+        if absent := [name for name in self._config.measures if name not in info]:
+            raise ValueError(f"gymnasium.measures names {absent}, and info has {sorted(info)}")
+        return self._frame(observed, info, success, bool(terminated or truncated))
 
     def close(self) -> None:
         self._cameras.close()
         self._env.close()
 
-    def _frame(self, observed: Any, success: bool = False, over: bool = False) -> Frame:
+    def _frame(self, observed: Any, info: Mapping[str, Any], success: bool = False, over: bool = False) -> Frame:
         pixels = self._config.pixels
         if pixels == CAMERAS:
             image = self._cameras(self._env.unwrapped)
         else:
             image = self._resized(np.asarray(self._env.render() if pixels == RENDER else _part(observed, pixels)))
-        return Frame(image, np.array([*self._state(observed).values()], np.float32), success, over)
+        truth = [float(info.get(name, np.nan)) for name in self._config.measures]
+        return Frame(image, np.array([*self._state(observed).values()], np.float32), success, over, truth)
 
     def _resized(self, image: UInt8Array) -> UInt8Array:
         pixels = self._config.pixels

@@ -1,4 +1,5 @@
-"""Success of a policy on given reset seeds, over a batch of environments. Shapes: E episodes, N environments."""
+"""Success of a policy on given reset seeds, over a batch of environments. Shapes: E episodes, N environments, G numbers
+of ground truth."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,6 +31,8 @@ class EvaluationResult:
     """Lower end of the 95 % Wilson interval of the success rate."""
     high: float
     """Upper end of that interval."""
+    largest: FloatArray
+    """float32 (E, G), of each number of the ground truth in the episode; NaN where the environment says none."""
 
     @property
     def episodes(self) -> int:
@@ -70,6 +73,7 @@ def evaluate(
     next_episode = min(num_envs, episodes)
     success = np.zeros(episodes, np.bool_)
     length = np.zeros(episodes, np.uint32)
+    largest = np.full((episodes, env.spec.ground_truth_dim), np.nan, np.float32)
     done = 0
     observation = env.reset(None, _seeds(first_seed, playing))
     while done < episodes:
@@ -81,7 +85,9 @@ def evaluate(
             ])
         result = env.step(act_in_rows(policy, observation, noise))
         observation = result.observation
-        ended = (result.terminated | result.truncated) & result.valid & (playing >= 0)
+        played = result.valid & (playing >= 0)
+        largest[playing[played]] = np.fmax(largest[playing[played]], result.ground_truth[played])
+        ended = (result.terminated | result.truncated) & played
         if not ended.any():
             continue
         success[playing[ended]] = result.terminated[ended]
@@ -98,7 +104,7 @@ def evaluate(
             observation = env.reset(mask, _seeds(first_seed, playing))
         on_progress(done, int(success.sum()))
     low, high = wilson_interval(int(success.sum()), episodes)
-    return EvaluationResult(success, length, first_seed, low, high)
+    return EvaluationResult(success, length, first_seed, low, high, largest)
 
 
 def act_in_rows(policy: ImagePolicy, seen: Observation, noise: FloatArray | None = None) -> FloatArray:
