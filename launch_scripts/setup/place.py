@@ -44,9 +44,11 @@ def present(venv: Path, root: Path) -> dict[str, str]:
 
 
 def refuse_links(root: Path, folders: Iterable[Path]) -> None:
-    """Raise SetupError where a folder is a link into another checkout than `root`: what is written there is no longer
-    the other's."""
+    """Raise SetupError where a folder is a link that leads nowhere, or into another checkout than `root`: what is
+    written there is no longer the other's."""
     for folder in folders:
+        if folder.is_symlink() and not folder.exists():
+            raise SetupError(f"{folder} is a link that leads nowhere; remove it")
         homes = [parent for parent in folder.resolve().parents if (parent / "launch_scripts" / "setup").is_dir()]
         if folder.is_symlink() and homes and homes[0] != root.resolve():
             raise SetupError(

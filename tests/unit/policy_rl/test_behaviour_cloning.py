@@ -97,6 +97,33 @@ def test_only_successful_expert_episodes_are_demonstrations() -> None:
         demonstrations([failed, noisy, DEMOS[2]], 3)
 
 
+def test_the_weights_with_the_least_error_on_held_out_demonstrations_are_kept() -> None:
+    rng = np.random.default_rng(0)
+    wrong = [replace(d, actions=rng.uniform(-1, 1, d.actions.shape).astype(np.float32)) for d in DEMOS[:8]]
+    policy, longer = toy_policy(), settings(num_iterations=200, heldout=0.25)
+    result = train_sft(policy, wrong, longer, 0)  # nothing carries over: the longer, the worse
+    best = min(result.heldout_losses, key=lambda step: result.heldout_losses[step])
+    assert best < 200 and result.heldout_losses[200] > result.heldout_losses[best]
+    assert result.num_samples == sum(demo.num_steps for demo in wrong[:6])
+    stopped = toy_policy()
+    train_sft(stopped, wrong[:6], longer.model_copy(update={"num_iterations": best, "heldout": 0.0}), 0)
+    assert all(torch.equal(policy.state_dict()[name], value) for name, value in stopped.state_dict().items())
+    with pytest.raises(ValueError, match=r"sft\.heldout 0.1 of 2 demonstrations is 0"):
+        train_sft(toy_policy(), DEMOS[:2], settings(heldout=0.1), 0)
+
+
+def test_weight_decay_and_dropout_change_the_weights_and_are_repeatable() -> None:
+    def weights(dropout: float, **changes: float) -> torch.Tensor:
+        policy = toy_policy()
+        policy.config = policy.config.model_copy(update={"dropout": dropout})
+        train_sft(policy, DEMOS[:4], settings(num_iterations=20, **changes), 0)
+        assert policy.actor.kept is None
+        return policy.state_dict()["actor.output.weight"]
+
+    assert not torch.equal(weights(0.0), weights(0.0, weight_decay=0.1))
+    assert not torch.equal(weights(0.0), weights(0.5)) and torch.equal(weights(0.5), weights(0.5))
+
+
 def test_other_data_are_refused() -> None:
     with pytest.raises(ValueError, match="noisy"):
         train_sft(toy_policy(), [replace(DEMOS[0], behaviour="noisy")], settings(), 0)

@@ -86,10 +86,12 @@ def test_too_much_disagreement_truncates_and_pays_nothing() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("mode", "positions"), [("delta", False), ("abs", False), ("delta", True)])
-def test_the_dense_reward_is_that_of_the_reward_model_and_a_missing_goal_is_missing(mode: str, positions: bool) -> None:
+@pytest.mark.parametrize(
+    ("mode", "inputs"), [("delta", "latents"), ("abs", "latents"), ("delta", "both"), ("delta", "positions")]
+)
+def test_the_dense_reward_is_that_of_the_reward_model_and_a_missing_goal_is_missing(mode: str, inputs: str) -> None:
     config = config_of(reward__dense_weight=0.5, reward__mode=mode, reward__goal_threshold=0.99995,
-                       reward__dense_clip=0.1, simulation__max_episode_steps=2, policy__positions=positions)
+                       reward__dense_clip=0.1, simulation__max_episode_steps=2, policy__inputs=inputs)
     lockstep, found = both(config, 32)
     rewards = lockstep.rewards_TN[lockstep.valid_TN]
     assert len(np.unique(rewards)) > 10

@@ -36,6 +36,14 @@ def test_positions_reach_the_hidden_layers_unprojected() -> None:
     assert (means[0] != means[1]).all()
 
 
+def test_positions_alone_need_no_projection() -> None:
+    read = ImageEncoder(lambda images: images.float().flatten(1)[:, :4], 4, "abc", "positions", 4)
+    policy = ImagePolicy(read, 3, 3, load_config("base").policy, seed=0)
+    assert policy.actor.hidden[0].in_features == 4 + 3
+    assert not any("projection" in name or "norm" in name for name in policy.state_dict())
+    assert policy.act(IMAGES, STATES).actions.shape == (5, 3)
+
+
 def gaussians(*means_and_stds: tuple[float, float]) -> DiagonalGaussian:
     """One sample whose dimensions have these means and standard deviations."""
     means, stds = torch.tensor(means_and_stds).unbind(-1)

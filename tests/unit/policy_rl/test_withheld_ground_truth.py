@@ -36,7 +36,7 @@ def record(folder: Path, change: Callable[[FloatArray], FloatArray] = lambda tru
 def settings(ground_truth: bool, **changes: object) -> RunConfig:
     torch.set_num_threads(1)
     wanted = {
-        "data.ground_truth": ground_truth, "policy.positions": True, "tokenizer.probe_iterations": 2,
+        "data.ground_truth": ground_truth, "policy.inputs": "both", "tokenizer.probe_iterations": 2,
         "tokenizer.decoder_iterations": 2,
     }
     return load_config("smoke", {**TINY, **wanted, **changes})
@@ -71,6 +71,8 @@ def test_neither_model_nor_policy_has_an_input_or_output_for_positions(bag: Path
     assert models.tokenizer.probe is None and models.action.done.positions is None and models.probe is None
     assert models.spec.ground_truth_names == () and models.tasks == ("push_cube",)
     assert make_policy(config, tmp_path / "model").encoder.num_positions == 0
+    with pytest.raises(ValueError, match=r"policy\.inputs is positions, and the model in .* reads none; take latents"):
+        make_policy(settings(False, **{"policy.inputs": "positions"}), tmp_path / "model")
     assert "the recorded ground truth is not used (data.ground_truth)" in models.manifest["data"]["summary"]
 
 

@@ -399,3 +399,11 @@ def test_an_environment_that_a_link_puts_on_another_disk_is_no_other_checkout(tm
     link = tmp_path / "checkout" / ".venv"
     link.symlink_to(tmp_path / "disk" / "venv")
     place.refuse_links(tmp_path / "checkout", (link, tmp_path / "absent"))
+
+
+@pytest.mark.parametrize("target", ["absent", "itself"])
+def test_a_link_that_leads_nowhere_is_refused_in_one_line(target: str, tmp_path: Path) -> None:
+    link = tmp_path / "itself"
+    link.symlink_to(tmp_path / target)
+    with pytest.raises(place.SetupError, match="itself is a link that leads nowhere; remove it"):
+        place.refuse_links(tmp_path, (link,))

@@ -96,7 +96,7 @@ def trajectory(model: Model, plan: Plan, precision: str, device: str) -> dict[st
         )
         for step in range(plan.num_steps):
             noise = torch.from_numpy(action_noise(config.seed, 1, step, spec.num_envs, spec.action_dim)).to(env.device)
-            features = env.encode(positions=config.policy.positions)
+            features = env.encode(config.policy.inputs)
             actions = policy.distribution(features, env.states_NP).executed(noise)
             result = env.step(actions)
             for name, value in zip(COMPARED, (env.encode(), result.signal_N.logit(SMALLEST), actions), strict=True):

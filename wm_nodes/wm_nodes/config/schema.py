@@ -34,6 +34,7 @@ TaskName = Annotated[
 the spec of the environment, of its recordings or of the model that was trained on them."""
 ScenesName = Annotated[str, AfterValidator(check_scenes)]
 """Name of a split or of a scene, see config/scenes.py."""
+PolicyInputs = Literal["latents", "positions", "both"]
 DeviceName = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 """Where models compute: cpu, cuda, cuda:N, or auto (a GPU where there is one), see core/device.py."""
 
@@ -215,8 +216,11 @@ class PolicyConfig(SettingsSection):
     """Width to which the encoder features are projected first; keeps the weights below the 1 MiB that travel inline."""
     init_log_std: float
     """Initial log standard deviation of the Gaussian, normalised action units."""
-    positions: bool
-    """Whether the policy also sees the positions that the tokenizer's probe reads off the latents, unprojected."""
+    inputs: PolicyInputs
+    """What the policy sees of a picture, beside the state: the tokenizer's latents, projected; the positions that its
+    probe reads off them, as they are, which are privileged where it learned them from a simulator; or both."""
+    dropout: Annotated[float, Field(ge=0, lt=1)]
+    """Share of the projected latents that cloning hides from the actor in each gradient step."""
     position_center_m: tuple[float, float, float] = (0.6, 0.0, 0.15)
     """Commanded positions (x, y, z) are shifted by it before the networks see them."""
     position_scale_m: PositiveFloat = 0.2
@@ -241,6 +245,11 @@ class SftConfig(SettingsSection):
     """Transitions per gradient step."""
     learning_rate: PositiveFloat
     """Of the actor."""
+    weight_decay: NonNegativeFloat
+    """Of AdamW."""
+    heldout: Fraction
+    """Share of the demonstrations that are not learned: the weights with the least error on them are kept. 0: those of
+    the last gradient step."""
     bags: list[str] = Field(default=[])
     """Recordings whose successful episodes are the demonstrations, whoever acted; empty: MPLib plans them."""
 

@@ -1,6 +1,7 @@
-"""Behaviour cloning (RS-11): the weak policy that RL starts from. Shapes: B batch, F features, A action."""
+"""Behaviour cloning (RS-11): the weak policy that RL starts from. Shapes: B batch, F features, S state, A action."""
 
-from collections.abc import Callable, Iterable, Sequence
+import copy
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
@@ -16,14 +17,34 @@ from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.recording.episode_arrays import check_finite
 
 EXPERT = "expert"
+CHECKS = 40
+"""How often in a training the error on held-out demonstrations is taken."""
 
 
 @dataclass(frozen=True)
 class SftResult:
-    """losses: mean squared action error of every iteration's batch. num_samples: images trained on."""
+    """What a training gave."""
 
     losses: NDArray[np.float32]
+    """Mean squared action error of every gradient step's batch."""
     num_samples: int
+    """Images trained on."""
+    heldout_losses: Mapping[int, float]
+    """The same of held-out demonstrations, by the gradient steps made; empty without any."""
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """What is learned from; a row per image."""
+
+    features_BF: Tensor
+    states_BS: Tensor
+    actions_BA: Tensor
+
+    def error(self, policy: ImagePolicy, rows: Tensor | slice = slice(None)) -> Tensor:
+        """Mean squared error of the actor's mean."""
+        mean_BA = policy.distribution(self.features_BF[rows], self.states_BS[rows]).mean_BA
+        return (mean_BA - self.actions_BA[rows]).square().mean()
 
 
 def demonstrations(episodes: Iterable[Episode], count: int) -> list[Episode]:
@@ -46,7 +67,8 @@ def train_sft(
     policy: ImagePolicy, demos: Sequence[Episode], config: SftConfig, seed: int, *,
     reconstruct: Callable[[UInt8Array], UInt8Array] | None = None,
 ) -> SftResult:
-    """Fit the actor's mean to the demonstrated actions in place; critic and log standard deviation stay.
+    """Fit the actor's mean to the demonstrated actions in place; critic and log standard deviation stay. With
+    config.heldout the last demonstrations are not learned, and the weights with the least error on them are kept.
 
     Steps after the first success are left out: an episode ends there when a policy acts. The demonstrations also set
     the policy's feature normalisation. Every image counts once, and with `reconstruct` (the tokenizer's decode of
@@ -54,12 +76,51 @@ def train_sft(
     With one seed and one number of torch threads the result is bit-identical on a CPU.
 
     Raises:
-        ValueError: no demonstrations, one that is not the expert's, or as check_finite.
+        ValueError: no demonstrations, none left to learn or to hold out, one that is not the expert's, or as
+            check_finite.
     """
     others = {episode.behaviour for episode in demos} - {EXPERT}
     if not demos or others:
         raise ValueError(f"behaviour cloning needs {EXPERT} demonstrations, got {len(demos)} with {sorted(others)}")
     check_finite(demos)
+    num_heldout = round(config.heldout * len(demos))
+    if config.heldout and not 0 < num_heldout < len(demos):
+        raise ValueError(f"sft.heldout {config.heldout} of {len(demos)} demonstrations is {num_heldout}; give a share "
+                         "that holds at least one out and leaves one")
+    learned = _frames(policy, demos[: len(demos) - num_heldout], reconstruct)
+    heldout = _frames(policy, demos[len(demos) - num_heldout :], reconstruct) if num_heldout else None
+    policy.fit_normaliser(learned.features_BF)
+    optimizer = torch.optim.AdamW(
+        policy.actor.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
+    )
+    generator, hiding = torch_stream(seed, "sft"), torch_stream(seed, "sft_dropout")
+    dropout, losses, errors = policy.config.dropout, list[Tensor](), dict[int, float]()
+    best = copy.deepcopy(policy.actor.state_dict())
+    for step in range(1, config.num_iterations + 1):
+        index = torch.randint(len(learned.features_BF), (config.batch_size,), generator=generator).to(policy.device)
+        if dropout:
+            draws = torch.rand(config.batch_size, policy.config.projection, generator=hiding)
+            policy.actor.kept = (draws >= dropout).float().to(policy.device) / (1 - dropout)
+        loss = learned.error(policy, index)
+        policy.actor.kept = None
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        losses.append(loss.detach())
+        if heldout and (step % max(1, config.num_iterations // CHECKS) == 0 or step == config.num_iterations):
+            with torch.no_grad():
+                errors[step] = float(heldout.error(policy))
+            if errors[step] == min(errors.values()):
+                best = copy.deepcopy(policy.actor.state_dict())
+    if heldout:
+        policy.actor.load_state_dict(best)
+    return SftResult(torch.stack(losses).cpu().numpy(), len(learned.features_BF), errors)
+
+
+def _frames(
+    policy: ImagePolicy, demos: Sequence[Episode], reconstruct: Callable[[UInt8Array], UInt8Array] | None
+) -> _Frames:
+    """Arguments: as of train_sft."""
     steps = [int(demo.success.argmax()) if demo.success.any() else demo.num_steps for demo in demos]
     images, states, actions = (
         np.concatenate([getattr(demo, name)[:count] for demo, count in zip(demos, steps, strict=True)])
@@ -70,17 +131,4 @@ def train_sft(
     if reconstruct is not None:
         features.append(policy.features(reconstruct(images)))
         states_BS, actions_BA = torch.cat([states_BS, states_BS]), torch.cat([actions_BA, actions_BA])
-    features_BF = torch.cat(features)
-    policy.fit_normaliser(features_BF)
-    optimizer = torch.optim.Adam(policy.actor.parameters(), lr=config.learning_rate)
-    generator = torch_stream(seed, "sft")
-    losses = list[Tensor]()
-    for _ in range(config.num_iterations):
-        index = torch.randint(len(features_BF), (config.batch_size,), generator=generator).to(policy.device)
-        mean_BA = policy.distribution(features_BF[index], states_BS[index]).mean_BA
-        loss = (mean_BA - actions_BA[index]).square().mean()
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-        losses.append(loss.detach())
-    return SftResult(torch.stack(losses).cpu().numpy(), len(features_BF))
+    return _Frames(torch.cat(features), states_BS, actions_BA)

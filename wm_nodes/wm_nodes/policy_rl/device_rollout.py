@@ -95,6 +95,8 @@ class DeviceCollector:
             "values": zeros(), "signal": zeros(), "uncertainty": zeros(), "terminated": zeros(dtype=torch.bool),
             "truncated": zeros(dtype=torch.bool), "valid": zeros(dtype=torch.bool), "starts": zeros(dtype=torch.int64),
         }
+        if self._goals is not None and policy.encoder.inputs == "positions":  # the reward compares latents
+            self._row["latents"] = zeros(self._goals[0].shape[-1])
         self._run = self._captured(capture or (partial(capture_graph, device) if device.type == "cuda" else None))
 
     @torch.no_grad()
@@ -132,7 +134,7 @@ class DeviceCollector:
         self._begins_N.fill_(True)
         self._just_ended_N.fill_(False)
         env.finite.fill_(True)
-        reached = ("images", "features", "states")  # one row more: what the last step reached
+        reached = ("images", "features", "states", "latents")  # one row more: what the last step reached
         columns = {
             name: row.new_empty(steps + (name in reached), *row.shape) for name, row in self._row.items()
         }
@@ -145,6 +147,8 @@ class DeviceCollector:
         columns["images"][-1].copy_(env.frames_NHWC)
         columns["features"][-1].copy_(self._features())
         columns["states"][-1].copy_(env.states_NP)
+        if "latents" in columns:
+            columns["latents"][-1].copy_(env.encode())
         rewards, rewarded = self._rewards(columns)
         env.check_finite()
         features, states = columns["features"], columns["states"]
@@ -176,6 +180,8 @@ class DeviceCollector:
             images=env.frames_NHWC, features=features, states=env.states_NP, actions=actions,
             logprobs=distribution.logprob(actions), values=policy.value(features, env.states_NP), starts=env.starts_N,
         )
+        if "latents" in self._row:
+            self._put(latents=env.encode())
         result = env.step(actions)
         self._put(
             signal=result.signal_N, uncertainty=result.uncertainty_N, terminated=result.terminated_N,
@@ -185,7 +191,7 @@ class DeviceCollector:
         self._just_ended_N.copy_(result.terminated_N | result.truncated_N)
 
     def _features(self) -> Tensor:
-        return self.env.encode(positions=self.policy.encoder.num_positions > 0)
+        return self.env.encode(self.policy.encoder.inputs)
 
     def _put(self, **values: Tensor) -> None:
         for name, value in values.items():
@@ -198,9 +204,9 @@ class DeviceCollector:
         rewards = reward.config.sparse_weight * reward.crossed(signal, spread).float()
         if self._goals is not None:
             goals, found = self._goals
-            features = columns["features"][..., : goals.shape[-1]]  # without positions
+            latents = columns.get("latents", columns["features"][..., : goals.shape[-1]])  # without positions
             wanted = goals[columns["starts"]]
-            before, after = (_distance_of(reward).between(f, wanted) for f in (features[:-1], features[1:]))
+            before, after = (_distance_of(reward).between(f, wanted) for f in (latents[:-1], latents[1:]))
             dense = reward.config.dense_weight * reward.approach(before, after)
             valid = valid & found[columns["starts"]] & torch.isfinite(dense)
             rewards = dense + rewards

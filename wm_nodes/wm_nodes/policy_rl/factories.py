@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
-from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.schema import PolicyInputs, RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import has_simulator
 from wm_nodes.core.cameras import CameraModel
@@ -60,19 +60,24 @@ def models_of(model_dir: Path, device: str = CPU) -> WorldModels:
     return load_model_folder(model_dir, compute_device(device))
 
 
-def make_encoder(model_dir: Path, device: str = CPU, *, positions: bool = False) -> ImageEncoder:
-    """Return the tokenizer as the policy's frozen image encoder, see Tokenizer.flatten."""
+def make_encoder(model_dir: Path, device: str = CPU, inputs: PolicyInputs = "latents") -> ImageEncoder:
+    """Return the tokenizer as the policy's frozen image encoder, see Tokenizer.flatten.
+
+    Raises:
+        ValueError: positions alone of a model that reads none.
+    """
     models = models_of(Path(model_dir), device)
-    tokenizer, count = models.tokenizer, models.tokenizer.num_positions if positions else 0
+    tokenizer, count = models.tokenizer, 0 if inputs == "latents" else models.tokenizer.num_positions
+    if inputs == "positions" and not count:
+        raise ValueError(f"policy.inputs is positions, and the model in {model_dir} reads none; take latents")
 
     def encode(images: Tensor) -> Tensor:
         latents = tokenizer.encode(images)
         with compute_context(tokenizer.device):
-            return tokenizer.flatten(latents, positions=positions).clone()
+            return tokenizer.flatten(latents, inputs).clone()
 
-    return ImageEncoder(
-        encode, tokenizer.num_tokens * tokenizer.latent_dim + count, models.tokenizer_sha256, num_positions=count
-    )
+    latents = 0 if inputs == "positions" else tokenizer.num_tokens * tokenizer.latent_dim
+    return ImageEncoder(encode, latents + count, models.tokenizer_sha256, inputs, count)
 
 
 def chosen_model(config: RunConfig, folder: str = "") -> Path | None:
@@ -102,7 +107,7 @@ def make_policy(config: RunConfig, model_dir: Path | None) -> ImagePolicy:
     if model_dir is None:
         raise ValueError(f"a policy sees by a world model's tokenizer; name a model's folder, or policy.factory, e.g. "
                          f"{UNTRAINED}")
-    encoder = make_encoder(model_dir, config.device, positions=config.policy.positions)
+    encoder = make_encoder(model_dir, config.device, config.policy.inputs)
     spec = run_spec(config, model_dir)
     state_range = commanded_range(spec, config.policy)
     if spec.measured:

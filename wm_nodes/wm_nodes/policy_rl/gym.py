@@ -57,7 +57,7 @@ class Observed:
     """
 
     def __init__(self, names: Sequence[str], space: spaces.Dict, folder: Path, device: str) -> None:
-        encoder = make_encoder(folder, device, positions=True)
+        encoder = make_encoder(folder, device, "both")
         sizes = {LATENTS: encoder.feature_dim - encoder.num_positions, POSITIONS: encoder.num_positions}
         boxes = {**space} | {name: spaces.Box(-np.inf, np.inf, (size,)) for name, size in sizes.items() if size}
         chosen = [name for name in names if name in boxes or name != "state"]

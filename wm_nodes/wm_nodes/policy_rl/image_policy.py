@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from wm_nodes.config.schema import PolicyConfig
+from wm_nodes.config.schema import PolicyConfig, PolicyInputs
 from wm_nodes.core.seeding import stream_seed
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import FloatArray, UInt8Array
@@ -34,6 +34,8 @@ class ImageEncoder:
     """F, features of an image."""
     sha256: str = ""
     """Of the weights behind it; "" when it has none."""
+    inputs: PolicyInputs = "latents"
+    """What the features are, where a tokenizer gives them."""
     num_positions: int = 0
     """How many of the last features are positions, which a policy does not project."""
 
@@ -187,23 +189,33 @@ class ImagePolicy(nn.Module):
 
 
 class _Network(nn.Module):
-    """Features -> LayerNorm -> projection; with positions and state -> MLP of `depth` hidden layers -> output."""
+    """Latents -> LayerNorm -> projection; with positions and state -> MLP of `depth` hidden layers -> output.
+
+    kept: what the projected latents are multiplied by (B, projection), for dropout; None: nothing.
+    """
+
+    kept: Tensor | None = None
 
     def __init__(
         self, encoder: ImageEncoder, state_dim: int, output_dim: int, config: PolicyConfig, *, output_gain: float
     ) -> None:
         super().__init__()
         self.projected_dim = encoder.feature_dim - encoder.num_positions
-        self.norm = nn.LayerNorm(self.projected_dim)
-        self.projection = _linear(self.projected_dim, config.projection)
-        sizes = [config.projection + encoder.num_positions + state_dim, *[config.width] * config.depth]
+        if self.projected_dim:
+            self.norm = nn.LayerNorm(self.projected_dim)
+            self.projection = _linear(self.projected_dim, config.projection)
+        projected = config.projection if self.projected_dim else 0
+        sizes = [projected + encoder.num_positions + state_dim, *[config.width] * config.depth]
         self.hidden = nn.ModuleList([_linear(i, o) for i, o in pairwise(sizes)])
         self.output = _linear(config.width, output_dim, gain=output_gain)
 
     def forward(self, features_BF: Tensor, states_BS: Tensor) -> Tensor:
         latents, positions = features_BF[..., : self.projected_dim], features_BF[..., self.projected_dim :]
-        projected = nn.functional.silu(self.projection(self.norm(latents)))
-        hidden = torch.cat([projected, positions, states_BS], dim=-1)
+        hidden = torch.cat([positions, states_BS], dim=-1)
+        if self.projected_dim:
+            projected = nn.functional.silu(self.projection(self.norm(latents)))
+            projected = projected if self.kept is None else projected * self.kept
+            hidden = torch.cat([projected, hidden], dim=-1)
         for layer in self.hidden:
             hidden = nn.functional.silu(layer(hidden))
         return cast(Tensor, self.output(hidden))

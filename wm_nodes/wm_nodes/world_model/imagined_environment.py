@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wm_nodes.config.schema import RewardConfig
+from wm_nodes.config.schema import PolicyInputs, RewardConfig
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
@@ -152,13 +152,13 @@ class DeviceEnvironment(DeviceEpisodes):
     def goals(self) -> tuple[UInt8Array, BoolArray] | None:
         return self._goals
 
-    def encode(self, *, positions: bool = False) -> Tensor:
+    def encode(self, inputs: PolicyInputs = "latents") -> Tensor:
         """Features (N, F) float32 of the frames shown for a policy: Tokenizer.flatten of Tokenizer.encode."""
         with self._autocast():
             latents = self._tokenizer.bottleneck(
                 self._tokenizer.features(self.frames_NHWC.permute(0, 3, 1, 2).float() / 255)
             )
-            return self._tokenizer.flatten(latents, positions=positions)
+            return self._tokenizer.flatten(latents, inputs)
 
     def _begin(self, begins_N: Tensor) -> None:
         for imagined in self.imagined:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from wm_nodes.config.schema import TokenizerConfig
+from wm_nodes.config.schema import PolicyInputs, TokenizerConfig
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.world_model.parts import in_parts
 from wm_nodes.world_model.precision import compute_context
@@ -134,10 +134,13 @@ class Tokenizer(nn.Module):
         values: Tensor = flat[:, :0] if self.probe is None else self.probe(flat)
         return values.float()
 
-    def flatten(self, latents_BSD: Tensor, *, positions: bool) -> Tensor:
-        """A policy's features (B, S D) of latents; with `positions`, the normalised ones (B, P) follow."""
-        flat = latents_BSD.flatten(1)
-        return torch.cat([flat, self.read_state_normalised(latents_BSD)], 1) if positions else flat
+    def flatten(self, latents_BSD: Tensor, inputs: PolicyInputs) -> Tensor:
+        """A policy's features of latents: they themselves (B, S D), the normalised positions (B, P), or one after the
+        other."""
+        if inputs == "latents":
+            return latents_BSD.flatten(1)
+        positions = self.read_state_normalised(latents_BSD)
+        return positions if inputs == "positions" else torch.cat([latents_BSD.flatten(1), positions], 1)
 
     def to_pixels(self, images: UInt8Array | Tensor) -> Tensor:
         """Float (B, 3, H, W) in [0, 1] of uint8 images (B, H, W, 3).
