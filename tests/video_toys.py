@@ -8,6 +8,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
+from torch.distributions import Normal
 
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.shipped import shipped_model
@@ -37,6 +38,11 @@ def randn(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> Ten
 
 def times(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
+
+
+def mean_logprob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """DD-14 per row of (M, U)."""
+    return Normal(mean, std).log_prob(x).mean(1)
 
 
 def toy_condition(
@@ -149,7 +155,7 @@ def toy_buffer(
         iteration=iteration,
         config_hash=config_hash(settings),
     )
-    return buffer.with_rewards({"brightness": rollout.latents[:, 0].mean((1, 2, 3))})
+    return buffer.with_rewards({"total": rollout.latents[:, 0].mean((1, 2, 3))})
 
 
 def train_rounds(learner: GrpoLearner, rounds: range) -> None:

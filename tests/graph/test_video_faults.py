@@ -30,7 +30,6 @@ from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.recorded_buffers import read_clips
-from wm_nodes.video_rl.reference_reward import attach_rewards
 from wm_nodes.video_rl.training_run import CHECKPOINT
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
@@ -142,7 +141,7 @@ def _train_on(make: Callable[[VideoLoop], Any]) -> Callable[[VideoLoop], TrainVi
 def _without_rewards(loop: VideoLoop) -> Any:
     done = loop.train(0).iterations
     buffer = loop.local.buffer(done, done)
-    return attach_rewards(buffer, {}, torch.full((len(buffer),), torch.nan))
+    return buffer.with_rewards({"total": torch.full((len(buffer),), torch.nan)})
 
 
 def _of_other_settings(loop: VideoLoop) -> Any:

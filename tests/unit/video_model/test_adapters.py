@@ -335,7 +335,7 @@ def rollout_of(
     unrewarded = RolloutBuffer(
         videos, rows, torch.tensor([0, 0, 1, 1]), torch.arange(N), {}, version, iteration, config_hash(settings),
     )
-    return unrewarded.with_rewards({"brightness": videos.latents.mean((1, 2, 3, 4))})
+    return unrewarded.with_rewards({"total": videos.latents.mean((1, 2, 3, 4))})
 
 
 def adapters() -> dict[str, PublicVelocity]:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from torch.distributions import Normal
 from torch.testing import assert_close
 from video_toys import (
     Analytic,
@@ -35,7 +34,6 @@ from wm_nodes.video_model import (
     step,
 )
 from wm_nodes.video_model.kernels import SIGMA_LIMIT, with_conditioning
-from wm_nodes.video_rl.ratio_and_kl import gaussian_logprob
 
 BIG = (1, 4, 8, 16, 16)
 """D = 8192."""
@@ -231,32 +229,6 @@ def test_the_variance_of_sage_is_the_integral_of_its_diffusion(t: float, s: floa
     x = torch.zeros(1, 1, 1, 1, 1, dtype=torch.float64)
     law = step(x, x, times(t), times(s), nothing_given(x), sampler_config("sage", 0.5))
     assert float(law.std.square()) == pytest.approx(integral, rel=1e-6)
-
-
-# the density
-
-
-def test_the_log_probability_is_that_of_a_normal_distribution() -> None:
-    x, mean = randn(3, 8192, seed=1), randn(3, 8192, seed=2)
-    std = 0.2 + torch.rand(3, 8192, generator=torch.Generator().manual_seed(3))
-    assert_close(gaussian_logprob(x, mean, std), Normal(mean, std).log_prob(x).mean(1), rtol=1e-6, atol=1e-6)
-
-
-def test_one_cell_one_deviation_off_has_the_log_probability_worked_by_hand() -> None:
-    found = gaussian_logprob(torch.tensor([[3.0]]), torch.tensor([[1.0]]), torch.tensor([[2.0]]))
-    assert float(found) == pytest.approx(-0.5 - math.log(2) - 0.9189385, abs=1e-6)
-
-
-@pytest.mark.parametrize("std", [0.1, 0.5, 0.8])
-def test_the_full_likelihood_is_that_of_cps_divided_by_twice_the_variance_plus_constants(std: float) -> None:
-    """Where errors are those of a float64 sum; cps is minus the mean square error."""
-    x, mean = randn(2, 8192, seed=1, dtype=torch.float64), randn(2, 8192, seed=2, dtype=torch.float64)
-    cps = -(x - mean).square().mean(1)
-    full = gaussian_logprob(x, mean, torch.full_like(x, std))
-    expected = cps / (2 * std**2) - math.log(std) - 0.5 * math.log(2 * math.pi)
-    assert_close(full, expected, atol=2e-7, rtol=2e-7)
-    assert_close(gaussian_logprob(x.float(), mean.float(), torch.full_like(x.float(), std)).double(), full,
-                 rtol=1e-6, atol=1e-6)
 
 
 # what carries gradient

@@ -19,6 +19,7 @@ from video_toys import (
     advantage_config,
     grpo_config,
     kl_config,
+    mean_logprob,
     times_of,
     tiny_network,
     toy_buffer,
@@ -34,7 +35,7 @@ from wm_nodes.training.weights import WeightsError
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError, StepContext, VideoNetwork, step
 from wm_nodes.video_rl.group_advantages import GroupAdvantages
 from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner
-from wm_nodes.video_rl.ratio_and_kl import Rows, gaussian_logprob
+from wm_nodes.video_rl.ratio_and_kl import Rows
 
 NO_KL = kl_config(beta=0.0)
 MODES = ["mean", "logk2"]
@@ -130,7 +131,7 @@ def logprob_gradient(learner: GrpoLearner, buffer: RolloutBuffer, kind: str) -> 
         t, s = times[k].expand(1), times[k + 1].expand(1)
         law = step(x_t, model(x_t, t, condition), t, s, context, learner.rollout.sampler)
         x, mean, std = (value.expand_as(x_t)[:, :, 1:].flatten(1) for value in (x_s, law.mean, law.std))
-        log = gaussian_logprob(x, mean, std)
+        log = mean_logprob(x, mean, std)
         if kind == "cps":
             log = -(x - mean).square().mean(1)
         total = total - SIGNAL.advantages_N[video].float() * log.sum() / len(rows.videos)
@@ -383,7 +384,7 @@ def _logprob(model: torch.nn.Module, learner: GrpoLearner, buffer: RolloutBuffer
     with torch.no_grad():
         law = step(x_t, model(x_t, t, condition), t, s, context, learner.rollout.sampler)
     x, mean, std = (value.expand_as(x_t)[:, :, 1:].flatten(1).double() for value in (x_s, law.mean, law.std))
-    return gaussian_logprob(x, mean, std)
+    return mean_logprob(x, mean, std)
 
 
 def test_a_larger_kl_weight_keeps_the_model_nearer_to_its_anchor() -> None:

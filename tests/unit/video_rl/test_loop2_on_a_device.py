@@ -59,9 +59,7 @@ SMALL = {
     "rewards": {"psnr_db": 1.0, "tracking": 1.0},
 }
 """The preset gpu at a size for tests."""
-NFT = {
-    "grpo.objective": "nft", "grpo.kl.anchor": "frozen", "grpo.nft.old_decay": 0.5, "grpo.nft.old_ramp": 1.0,
-}
+NFT = {"grpo.objective": "nft", "grpo.kl.anchor": "frozen"}
 Found = dict[str, Tensor]
 
 

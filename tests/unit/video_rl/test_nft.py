@@ -1,6 +1,5 @@
 """DiffusionNFT (DD-31) against its formula in numpy, its limits, and the learner's contracts with it."""
 
-import copy
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -45,8 +44,7 @@ ADVANTAGES = [1.5, -0.5, 0.25, -1.0, 2.5, -2.5, 0.0, 0.7]
 
 
 def nft_config(beta: float = 1.0, *, times: int = 3, **changes: Any) -> GrpoConfig:
-    decay = {name: changes.pop(name) for name in ("old_decay", "old_ramp") if name in changes}
-    nft = grpo_config().nft.with_values(beta=beta, times=times, **decay)
+    nft = grpo_config().nft.with_values(beta=beta, times=times)
     return grpo_config(**{
         "objective": "nft", "nft": nft, "kl": NO_KL, "learning_rate": 1e-3, "micro_batch": 8, **changes
     })
@@ -259,7 +257,7 @@ def test_the_gradients_of_two_ranks_add_up_to_that_of_one_and_a_rank_without_row
 
 @pytest.mark.slow
 def test_two_gloo_ranks_give_the_update_of_one(tmp_path: Path) -> None:
-    settings = nft_config(micro_batch=3, updates_per_buffer=3, learning_rate=1e-4, kl=FROZEN, old_decay=0.5)
+    settings = nft_config(micro_batch=3, updates_per_buffer=3, learning_rate=1e-4, kl=FROZEN)
     one = GrpoLearner(tiny_network(), settings, toy_rollout_settings(), seed=5)
     report = one.train(toy_buffer(one.model, one.rollout))
     mp.spawn(video_learner_rank, args=(2, str(tmp_path), settings), nprocs=2)
@@ -274,18 +272,16 @@ def test_two_gloo_ranks_give_the_update_of_one(tmp_path: Path) -> None:
 # old weights
 
 
-@pytest.mark.parametrize(("decay", "ramp", "kept"), [(0.0, 1.0, 0.0), (0.5, 0.1, 0.2), (0.5, 1.0, 0.5)])
-def test_the_old_weights_follow_after_each_buffer(decay: float, ramp: float, kept: float) -> None:
-    """Two optimizer steps: d = min(2 ramp, decay)."""
-    learner = make(old_decay=decay, old_ramp=ramp)
-    start = weights(learner.model)
-    assert all(torch.equal(value, start[name]) for name, value in learner.terms.old.items())
-    learner.train(buffer_of(learner))
-    for name, value in weights(learner.model).items():
-        assert_close(learner.terms.old[name], kept * start[name] + (1 - kept) * value)
+def test_the_old_weights_are_those_that_sampled_the_buffer() -> None:
+    learner = make()
+    for iteration in range(2):
+        start = weights(learner.model)
+        learner.train(buffer_of(learner, iteration=iteration))
+        assert all(torch.equal(value, start[name]) for name, value in learner.terms.old.items())
+    assert any(not torch.equal(value, start[name]) for name, value in weights(learner.model).items())
 
 
-STATEFUL = [{}, {"old_decay": 0.5, "old_ramp": 0.1}, {"kl": FROZEN}]
+STATEFUL = [{}, {"kl": FROZEN}]
 
 
 @pytest.mark.parametrize("changes", STATEFUL)
@@ -301,7 +297,6 @@ def test_three_rounds_equal_two_a_resume_and_one_bit_for_bit(tmp_path: Path, cha
     train_rounds(resumed, range(2, 3))
     for name, value in weights(straight.model).items():
         assert torch.equal(value, weights(resumed.model)[name]), name
-        assert torch.equal(straight.terms.old[name], resumed.terms.old[name]), name
     assert any(not torch.equal(value, weights(other.model)[name]) for name, value in weights(straight.model).items())
 
 
@@ -321,7 +316,7 @@ def test_a_gradient_that_is_not_finite_undoes_the_whole_buffer(changes: dict[str
     learner, undisturbed = make(**changes), make(**changes)
     for one in (learner, undisturbed):
         train_rounds(one, range(1))
-    buffer, before, old = buffer_of(learner, iteration=7), weights(learner.model), copy.deepcopy(learner.terms.old)
+    buffer, before = buffer_of(learner, iteration=7), weights(learner.model)
     calls = iter(range(1000))
     first = len(learner.rows(buffer, torch.ones(8).bool())) // 8 + 1
     handle = learner.parameters[0].register_hook(lambda g: g * (math.nan if next(calls) >= first else 1.0))
@@ -330,7 +325,6 @@ def test_a_gradient_that_is_not_finite_undoes_the_whole_buffer(changes: dict[str
     handle.remove()
     assert learner.version == 2
     assert all(torch.equal(value, before[name]) for name, value in weights(learner.model).items())
-    assert all(torch.equal(value, old[name]) for name, value in learner.terms.old.items())
     for one in (learner, undisturbed):
         one.train(buffer)
         one.train(buffer_of(one, iteration=8))
@@ -379,7 +373,7 @@ def test_the_ratio_still_needs_a_sampler_with_noise_and_names_this_objective() -
 
 def test_a_run_folder_of_ode_clips_resumes_and_writes_null_for_what_does_not_exist(tmp_path: Path) -> None:
     plain = load_video_config("smoke")
-    config = plain.with_values(rollout=ODE, grpo=nft_config(old_decay=0.3, old_ramp=1.0))
+    config = plain.with_values(rollout=ODE, grpo=nft_config())
 
     def train(run: VideoRun, rounds: int) -> VideoRun:
         for _ in range(rounds):

@@ -7,13 +7,12 @@ import torch
 from torch import Tensor
 from torch.distributions import Normal, kl_divergence
 from torch.testing import assert_close
-from video_toys import randn
+from video_toys import mean_logprob, randn
 
 from wm_nodes.video_rl.group_advantages import GroupAdvantages, best_of_n, group_advantages
 from wm_nodes.video_rl.ratio_and_kl import (
     clip_tails,
     clipped_objective,
-    gaussian_logprob,
     log_ratio,
     log_space_kl,
     mean_kl,
@@ -149,7 +148,7 @@ def test_videos_that_do_not_train_are_not_among_the_best() -> None:
 def test_the_ratio_from_normalised_noise_is_the_difference_of_two_log_probabilities() -> None:
     x, old, new, std = gaussians()
     direct = log_ratio((x - new) / std, (x - old) / std)
-    assert_close(direct, gaussian_logprob(x, new, std) - gaussian_logprob(x, old, std), atol=1e-12, rtol=0)
+    assert_close(direct, mean_logprob(x, new, std) - mean_logprob(x, old, std), atol=1e-12, rtol=0)
 
 
 def test_one_cell_moved_by_a_quarter_deviation_has_the_ratio_worked_by_hand() -> None:
@@ -166,7 +165,7 @@ def test_unmoved_noise_has_a_ratio_of_exactly_one_under_every_weight() -> None:
     for weight in (1.0, torch.rand(M, U)):
         assert log_ratio(zeta, zeta.clone(), weight).tolist() == [0.0] * M
     x, old, _, std = (value.float() for value in gaussians())
-    by_difference = gaussian_logprob(x, old, std) - gaussian_logprob(old + std * ((x - old) / std), old, std)
+    by_difference = mean_logprob(x, old, std) - mean_logprob(old + std * ((x - old) / std), old, std)
     assert float((by_difference.exp() - 1).abs().max()) < 1e-6
 
 

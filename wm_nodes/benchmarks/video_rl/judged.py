@@ -14,7 +14,7 @@ from wm_nodes.judge.service import JudgeService, TrainingPaused, agent_scores, b
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_rl.reference_reward import attach_rewards, mix_rewards
+from wm_nodes.video_rl.reference_reward import mix_rewards
 from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
 from wm_nodes.world_model.position_probe import PositionProbe
 
@@ -60,7 +60,7 @@ class JudgedContexts(RecordedContexts):
         if reason := pause_reason(self.verdicts):
             raise TrainingPaused(reason)
         scores = self.scores(request, frames) | agent_scores(self.verdicts)
-        return attach_rewards(clips, scores, mix_rewards(scores, self.config.rewards))
+        return clips.with_rewards({**scores, "total": mix_rewards(scores, self.config.rewards)})
 
 
 def open_judge(config: VideoRlConfig, clips: Clips, fps: float) -> JudgeService:

@@ -232,7 +232,7 @@ def _yardstick(video_model: Path, heldout_bags: tuple[Path, ...], device: torch.
     folder, probe = load_video_folder(video_model, device), load_probe(shipped_model(TASK), device)
     recordings, reader = load_clips(heldout_bags, folder.clip["stride"]), load_success_reader(video_model, TASK)
     by = make_yardstick(folder.codec, recordings, probe, reader, load_config("cpu", {"task": TASK}).simulation)
-    return recordings.select(torch.arange(len(recordings))[:MEASURED]), by
+    return recordings.first(MEASURED), by
 
 
 def _accepted(frames: Tensor, heldout: Clips, config: VideoRlConfig, given: int, fps: float) -> FloatArray:

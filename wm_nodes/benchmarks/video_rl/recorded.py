@@ -101,7 +101,7 @@ class Resolution(OnDevice):
         rows, own = list[dict[str, Any]](), None
         for bags in tqdm(recordings, desc="resolution", unit="size"):
             clips = load_clips(bags, folder.clip["stride"])
-            clips = clips.select(torch.arange(min(self.contexts, len(clips))))
+            clips = clips.first(self.contexts)
             if own is None:
                 own = sample_clips(folder, clips, config)
             rows += size_rows(folder, clips, own, config, probe)

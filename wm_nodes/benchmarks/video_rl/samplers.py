@@ -116,7 +116,7 @@ def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
     """Learning: every sampler on one learner; `learner` holds what they share.
 
     Mix-GRPO and the samplers "window" train all four steps of a window that moves, as many as the others of their nine.
-    "signed FM" (DD-31 with old_decay 0) trains at three times: with a call of the old weights each they cost what the
+    "signed FM" (DD-31) trains at three times: with a call of the old weights each they cost what the
     others' four steps do, a call with its gradient counted as three.
     """
     nft = learner.with_values(
@@ -155,8 +155,8 @@ def clip_learning_samplers() -> list[SamplerSetup]:
 
 def outcome_samplers(preset: str = "outcome") -> list[SamplerSetup]:
     """Of the outcome task, or of another preset: CPS, DynDiff at the noise that CPS 0.4 spends, both in a window,
-    DynDiff with its literal mask, and DD-31 by ODE, whose clips differ in their initial noise: with old_decay 0 and one
-    update on a buffer that is flow matching with signed weights ("signed FM"), not the paper's DiffusionNFT."""
+    DynDiff with its literal mask, and DD-31 by ODE, whose clips differ in their initial noise: with one update
+    on a buffer that is flow matching with signed weights ("signed FM"), not the paper's DiffusionNFT."""
     learner = load_video_config(preset).grpo
     samplers = {
         "CPS 0.4": by_arm("cps", 0.4), "DynDiff 0.54 gated, rms": dyndiff(0.54, "gated", "rms"),

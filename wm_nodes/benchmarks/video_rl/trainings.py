@@ -8,7 +8,6 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
-import torch
 from pydantic import TypeAdapter
 
 from benchmarks.experiment import Count, OnDevice, console
@@ -136,7 +135,7 @@ class RecordedTrainings(Trainings[Plan]):
     def recordings(self, folder: VideoFolder, most: int) -> tuple[Clips, Clips]:
         """Clips of the bags to train on, and the first `most` held-out ones."""
         contexts, heldout = (load_clips(bags, folder.clip["stride"]) for bags in (self.context_bags, self.heldout_bags))
-        return contexts, heldout.select(torch.arange(len(heldout))[:most])
+        return contexts, heldout.first(most)
 
     def with_rate(self, setups: list[SamplerSetup]) -> list[SamplerSetup]:
         """The samplers with the learning rate that was given."""

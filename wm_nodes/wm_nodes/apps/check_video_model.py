@@ -73,7 +73,7 @@ def _print_headroom(
 ) -> None:
     """Groups and whole rollouts of the first contexts, per clip, and in words whether groups can teach anything."""
     probe = load_probe(shipped_model(config.task), folder.device)
-    clips = clips.select(torch.arange(min(contexts, len(clips))))
+    clips = clips.first(contexts)
     found = measure_headroom(folder, clips, config, probe)
     frames = sample_by_ode(folder, clips, config, config.rollout.num_steps)
     drift = {name: float(values.mean()) for name, values in horizon_scores(frames, clips, probe, folder).items()}
@@ -112,7 +112,7 @@ def _model_to_check(
         toy = draw_scenes(VIDEOS, config.seed, "doctor").condition()
         return load_base(device=device), toy.to(device), (CHANNELS, FRAMES, SIDE, SIDE), config
     folder, clips = recorded
-    clips = clips.select(torch.arange(min(VIDEOS, len(clips))))
+    clips = clips.first(VIDEOS)
     condition = clips.condition(folder.codec, folder.clip["num_conditioning"], folder.network.settings.text_dim)
     latents = folder.codec.encode(clips.frames)
     C, F, H, W = latents.shape[1:]

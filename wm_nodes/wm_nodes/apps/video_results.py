@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.shipped import shipped_model
@@ -111,7 +110,7 @@ def score_change(name: str, before: Sequence[float], after: Sequence[float], see
 
 def _strips(config: VideoRlConfig, run_dir: Path, heldout: Clips, folders: Sequence[VideoFolder]) -> list[Picture]:
     """The recording, the base model and the trained model from the same first frames and noise."""
-    shown = heldout.select(torch.arange(min(STRIPS, len(heldout))))
+    shown = heldout.first(STRIPS)
     frames = [sample_by_ode(folder, shown, config, config.evaluation.num_steps).cpu() for folder in folders]
     rows = dict(zip(("recorded", "before", "after"), [shown.frames, *frames], strict=True))
     pictures, given = [], "first frame" if config.groups.hide_actions else "first frame and actions"

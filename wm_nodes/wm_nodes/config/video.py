@@ -194,10 +194,6 @@ class NftConfig(SettingsSection):
     """How far the two implied velocities lie from the old one, in differences of the current and the old one."""
     times: PositiveInt
     """Forward times of each clip in one optimizer step."""
-    old_decay: Annotated[float, Field(ge=0, lt=1)]
-    """How much of the old weights stays after each buffer; 0: they are those that sample the next one."""
-    old_ramp: PositiveFloat
-    """The decay rises to old_decay by this much per optimizer step; from 1 on it is constant."""
 
 
 class GrpoConfig(SettingsSection):

@@ -26,7 +26,6 @@ from wm_nodes.training.ranks import Ranks, own_device
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import BufferReport
-from wm_nodes.video_rl.reference_reward import attach_rewards
 from wm_nodes.video_rl.reward_hacking import alarm_text
 from wm_nodes.video_rl.train import post_train, sample_buffers
 from wm_nodes.video_rl.training_run import VideoRun
@@ -190,7 +189,8 @@ def with_scores(buffer: RolloutBuffer, scores: ClipScores) -> RolloutBuffer:
         raise RolloutBufferError(f"scores of {scores.num_clips} clips for a buffer of {count}; judge this buffer")
     values = torch.from_numpy(np.array(scores.values, np.float64).reshape(len(names), count))
     total, valid = (torch.from_numpy(np.array(field, np.float64)) for field in (scores.total, scores.valid))
-    return attach_rewards(buffer, dict(zip(names, values, strict=True)), torch.where(valid > 0, total, torch.nan))
+    rewards = dict(zip(names, values, strict=True))
+    return buffer.with_rewards({**rewards, "total": torch.where(valid > 0, total, torch.nan)})
 
 
 def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> VideoRun:

@@ -49,7 +49,7 @@ class RolloutBuffer:
     sample_ids: Tensor
     """Place in the group, int64 (N,)."""
     rewards: Mapping[str, Tensor]
-    """Raw values by name, float64 (N,), NaN where missing."""
+    """Raw values by name, float64 (N,), NaN where missing; `total` trains."""
     policy_version: int
     """Optimizer steps of the weights that sampled."""
     iteration: int
@@ -62,12 +62,12 @@ class RolloutBuffer:
 
     @property
     def reward(self) -> Tensor:
-        """The reward that trains, float64 (N,): `total`, or the only one. Raises ValueError: there is neither."""
-        if "total" not in self.rewards and len(self.rewards) != 1:
+        """The reward that trains, float64 (N,): `total`. Raises ValueError where there is none."""
+        if "total" not in self.rewards:
             raise ValueError(
                 f"the buffer holds rewards {', '.join(self.rewards) or '(none)'} and no `total`; mix them first"
             )
-        return self.rewards["total"] if "total" in self.rewards else next(iter(self.rewards.values()))
+        return self.rewards["total"]
 
     @property
     def valid(self) -> Tensor:

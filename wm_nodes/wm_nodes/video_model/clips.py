@@ -53,6 +53,10 @@ class Clips:
             None if self.states is None else self.states[index.numpy()], self.spec,
         )
 
+    def first(self, count: int) -> "Clips":
+        """The first clips, or all where there are fewer."""
+        return self.select(torch.arange(min(count, len(self))))
+
     def first_states(self) -> FloatArray:
         """The states (E, S) that the clips begin with. Raises ValueError where they are unknown."""
         if self.states is None:

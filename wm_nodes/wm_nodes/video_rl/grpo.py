@@ -141,8 +141,8 @@ class GrpoLearner:
                 f"could be learned from; give fewer"
             )
         rewards, valid = buffer.reward, buffer.valid
-        # where it is: on a GPU once more the memory of the weights that train and of their two moments; anchor and old
-        # weights are replaced, never changed
+        # where it is: on a GPU once more the memory of the weights that train and of their two moments; the anchor is
+        # never changed
         state, counters = self._state(), self._counters()
         before = state | {
             part: {name: tensor.detach().clone() for name, tensor in state[part].items()}
@@ -162,9 +162,8 @@ class GrpoLearner:
         try:
             rows = self.rows(buffer, kept)
             steps = self.settings.updates_per_buffer if len(rows) else 0
+            self.terms.begin()
             updates = tuple(self._update(buffer, rows, advantages) for _ in range(steps))
-            if updates:
-                self.terms.move_old(self.version)
         except BaseException:
             self._set_state(before, counters)
             raise
@@ -226,9 +225,9 @@ class GrpoLearner:
         return UpdateReport(**means, grad_norm=norm, transitions=len(rows))
 
     def _state(self) -> dict[str, dict[str, Tensor]]:
-        """The tensors that train() depends on, not copied: trained, anchor's and old weights, optimizer."""
+        """The tensors that train() depends on, not copied: trained and anchor's weights, optimizer."""
         return {
-            "model": dict(trained_parameters(self.model)), "anchor": self.terms.anchor, "old": self.terms.old,
+            "model": dict(trained_parameters(self.model)), "anchor": self.terms.anchor,
             "optimizer": checkpoint.optimizer_tensors(self._optimizer),
         }
 
@@ -241,16 +240,14 @@ class GrpoLearner:
             parameter.copy_(state["model"][name])
         checkpoint.restore_optimizer(self._optimizer, state["optimizer"])
         device = device_of(self.model)
-        self.terms.anchor, self.terms.old = (
-            {name: value.to(device) for name, value in state[part].items()} for part in ("anchor", "old")
-        )
+        self.terms.anchor = {name: value.to(device) for name, value in state["anchor"].items()}
         self.version, self.iterations, self.skipped = counters["version"], counters["iteration"], counters["skipped"]
 
     # checkpoints
 
     def save(self, path: Path) -> None:
         """Write everything that train() depends on, atomically."""
-        header = {**self._counters(), "seed": self.seed}
+        header = {**self._counters(), "seed": self.seed, "objective": self.settings.objective}
         checkpoint.write_checkpoint(path, self._state(), {"grpo": json.dumps(header)})
 
     def load(self, path: Path) -> None:
@@ -269,9 +266,10 @@ class GrpoLearner:
         now = self._state()
         state = {part: checkpoint.section(tensors, f"{part}.") for part in now}
         check_same_layout(now["model"], state["model"], what=str(path))
-        for part, setting in (("anchor", "kl.anchor"), ("old", "objective")):
-            if bool(now[part]) != bool(state[part]):
-                raise ValueError(f"{path} was made with another grpo.{setting}; resume with its settings")
+        other_anchor = bool(now["anchor"]) != bool(state["anchor"])
+        if other_anchor or header.get("objective", self.settings.objective) != self.settings.objective:
+            setting = "kl.anchor" if other_anchor else "objective"
+            raise ValueError(f"{path} was made with another grpo.{setting}; resume with its settings")
         self._set_state(state, header)
 
 

@@ -25,7 +25,7 @@ from wm_nodes.video_rl.clip_faults import FaultLimits, FilmedScene, find_faults,
 from wm_nodes.video_rl.execution_reward import fit_tool_correction
 from wm_nodes.video_rl.reference_reward import score_clips
 from wm_nodes.video_rl.sampling import sample_by_ode
-from wm_nodes.video_rl.validation import evaluated_contexts, measured_once
+from wm_nodes.video_rl.validation import measured_once
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.positions import columns_of, probe_targets
 
@@ -120,17 +120,16 @@ def _measure(
     folder: VideoFolder, heldout: Clips, by: Yardstick, config: VideoRlConfig
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
     """All that can be measured, and why something cannot."""
-    contexts, missing, given = evaluated_contexts(heldout, config), dict[str, str](), folder.clip["num_conditioning"]
+    contexts, missing = heldout.first(config.evaluation.contexts), dict[str, str]()
     frames = sample_by_ode(folder, contexts, config, config.evaluation.num_steps)
     positions, count = by.probe.read(frames), min(config.evaluation.executions, len(contexts))
-    found = measure_clips(frames, positions, contexts, by, given)
+    found = measure_clips(frames, positions, contexts, by, folder.clip["num_conditioning"])
     if by.reader is None:
         missing["reader_success"] = "no success reader for clips of this codec"
     if not count:
         return found, missing | dict.fromkeys(EXECUTED, "evaluation.executions is 0")
     try:
-        rows = contexts.select(torch.arange(count))
-        found |= measure_executability(positions[:count], rows, by, folder.clip["stride"])
+        found |= measure_executability(positions[:count], contexts.first(count), by, folder.clip["stride"])
     except ValueError as error:
         missing |= dict.fromkeys(EXECUTED, str(error))
     return found, missing

@@ -3,9 +3,8 @@ from any sampler.
 
 Shapes: M rows (video, forward time) of one network call, U generated elements.
 
-v_old is the velocity of the old weights, a copy of the parameters that train. With nft.old_decay 0 it is theirs at the
-buffer's first update: those that sampled it. With nft.old_decay > 0 it lags behind, while the current weights go on
-sampling; the authors let the old ones sample.
+v_old is the velocity of the weights that sampled the buffer, a copy of the parameters that train. The authors' lags
+behind over several buffers, and samples.
 
 Times are those of the sampler in density: uniform, one in each of nft.times equal parts of (0, 1), then shifted by
 rollout.shift. Theirs are the sampler's own times, all of them, each with a noise of its own.
@@ -34,13 +33,10 @@ class NftTerms(Anchored):
 
     def __init__(self, model: nn.Module, settings: GrpoConfig, rollout: RolloutConfig, seed: int) -> None:
         super().__init__(model, settings, rollout, seed)
-        self.old = self.trained()
+        self.begin()
 
-    def move_old(self, version: int) -> None:
-        """Move the old weights towards the current ones after a buffer."""
-        decay = min(self.settings.nft.old_ramp * version, self.settings.nft.old_decay)
-        current = self.trained()
-        self.old = {name: value.lerp(self.old[name], decay) for name, value in current.items()} if decay else current
+    def begin(self) -> None:
+        self.old = self.trained()
 
     def choose(self, buffer: RolloutBuffer) -> Tensor:
         """Return which forward times train, bool (N, times): all."""

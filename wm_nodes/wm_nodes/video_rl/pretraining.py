@@ -23,7 +23,7 @@ from wm_nodes.video_model.folder import VideoFolder, load_video_folder, read_vid
 from wm_nodes.video_model.success_reader import save_success_reader, score_reader, train_success_reader
 from wm_nodes.video_model.tokenizer_codec import Codec, codec_of_world_model
 from wm_nodes.video_rl.reference_reward import score_clips
-from wm_nodes.video_rl.validation import evaluated_contexts, load_or_measure_scores
+from wm_nodes.video_rl.validation import load_or_measure_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
 CODEC_FRAMES, READER_ITERATIONS = 2000, 500
@@ -142,7 +142,7 @@ def _score_baselines(
     folder: VideoFolder, heldout: Clips, probe: PositionProbe, config: VideoRlConfig
 ) -> dict[str, float]:
     """Return mean scores without sampling. `copy_*`: of repeating the first frame. `codec_psnr_db`: of the codec."""
-    contexts = evaluated_contexts(heldout, config)
+    contexts = heldout.first(config.evaluation.contexts)
     K = folder.clip["num_conditioning"]
     copied = contexts.frames[:, :1].expand_as(contexts.frames)
     coded = folder.codec.decode(folder.codec.encode(contexts.frames))

@@ -10,7 +10,6 @@ cached, both are functions of the stored zeta and of the zeta that the current w
 so both are exactly 0 while the weights have not moved, and free of the cancellation of two large log-probabilities.
 """
 
-import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,11 +22,6 @@ from torch.func import functional_call
 from wm_nodes.config.video import GrpoConfig, RolloutConfig
 from wm_nodes.core.device import device_of
 from wm_nodes.video_model import GaussianTransition, RolloutBuffer, flow_times, select_steps, transition
-
-
-def gaussian_logprob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    """Return DD-14: the mean over elements of DD-12, log N(x; mean, std^2), per row of (M, U), nats per element."""
-    return (-0.5 * ((x - mean) / std).square() - std.log() - 0.5 * math.log(2 * math.pi)).mean(1)
 
 
 def log_ratio(new_zeta_MU: Tensor, old_zeta_MU: Tensor, weight_MU: Tensor | float = 1.0) -> Tensor:
@@ -104,9 +98,8 @@ class LossTerms(NamedTuple):
 
 
 class Anchored:
-    """A loss on `model` with weights beside it: an anchor's, and with objective nft those of v_old.
-
-    They are copies of the parameters that train, nothing else: with LoRA as small as the adapter.
+    """A loss on `model` with weights of an anchor beside it: copies of the parameters that train, nothing else. With
+    LoRA they are as small as the adapter.
 
     Raises:
         ValueError: the anchor is a model without its adapter, and there is none.
@@ -121,13 +114,11 @@ class Anchored:
         self.model, self.settings, self.rollout, self.seed = model, settings, rollout, seed
         self.anchor: dict[str, Tensor] = {}
         """Parameters of a frozen anchor by name; empty where the buffer or the bare model is the anchor."""
-        self.old: dict[str, Tensor] = {}
-        """Parameters of v_old (DD-31) by name; empty with objective ratio."""
         if settings.kl.anchor in ("frozen", "dual"):
             self.anchor = self.trained()
 
-    def move_old(self, version: int) -> None:
-        """Move the old weights after a buffer. version: optimizer steps made."""
+    def begin(self) -> None:
+        """Called before the first update on a buffer."""
 
     def trained(self) -> dict[str, Tensor]:
         """Copy the model's parameters that train."""

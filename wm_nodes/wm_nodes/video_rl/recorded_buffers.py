@@ -25,7 +25,7 @@ from wm_nodes.recording.raw import PARTIAL_SUFFIX
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_rl.execution_reward import EXECUTION_SCORES
-from wm_nodes.video_rl.reference_reward import attach_rewards, mix_rewards
+from wm_nodes.video_rl.reference_reward import mix_rewards
 from wm_nodes.video_rl.sampling import RecordedContexts
 
 
@@ -229,7 +229,7 @@ def recorded_buffer(
             "restore it, or train again from another run"
         )
     total = recorded.total if rewards is None else mix_rewards(recorded.scores, rewards)
-    return attach_rewards(RolloutBuffer.from_bytes(data), recorded.scores, total)
+    return RolloutBuffer.from_bytes(data).with_rewards({**recorded.scores, "total": total})
 
 
 def trained_clips(bags: Sequence[Path], iterations: int) -> list[RecordedClips]:

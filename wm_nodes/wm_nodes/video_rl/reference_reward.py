@@ -18,7 +18,6 @@ from torch import Tensor
 from wm_nodes.config.tasks import get_task
 from wm_nodes.core.types import FloatArray
 from wm_nodes.reward.picture_similarity import psnr_db, ssim
-from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.tokenizer_codec import Codec
 from wm_nodes.video_rl.execution_reward import ExecutionReward
@@ -182,11 +181,6 @@ def mix_rewards(values: Mapping[str, Tensor], weights: Mapping[str, float]) -> T
     if unknown or not weights:
         raise ValueError(f"unknown rewards {unknown}; weigh some of {', '.join(sorted(values))}")
     return torch.stack([weight * values[name].double() for name, weight in weights.items()]).sum(0)
-
-
-def attach_rewards(buffer: RolloutBuffer, scores: Mapping[str, Tensor], total: Tensor) -> RolloutBuffer:
-    """Return the buffer with raw scores and the mixed reward `total`; a clip whose total is NaN does not train."""
-    return buffer.with_rewards({**scores, "total": total})
 
 
 def _check_sizes(frames: Tensor, references: Clips) -> None:

@@ -21,7 +21,7 @@ from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.continuation import ClipLengths, clip_condition, continue_videos
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_rl.execution_reward import load_execution_reward
-from wm_nodes.video_rl.reference_reward import all_scores, attach_rewards, mix_rewards
+from wm_nodes.video_rl.reference_reward import all_scores, mix_rewards
 from wm_nodes.world_model.position_probe import PositionProbe
 
 
@@ -160,7 +160,7 @@ class RecordedContexts:
     def score(self, request: GroupRequest, clips: RolloutBuffer) -> RolloutBuffer:
         """Return the buffer with every score of its clips and the training reward `total`, mixed by config.rewards."""
         scores = self.scores(request, self.folder.codec.decode(clips.rollout.latents))
-        return attach_rewards(clips, scores, mix_rewards(scores, self.config.rewards))
+        return clips.with_rewards({**scores, "total": mix_rewards(scores, self.config.rewards)})
 
     def scores(self, request: GroupRequest, frames: Tensor, also: Collection[str] = ()) -> dict[str, Tensor]:
         """Return all_scores of the request's decoded clips, uint8 (N, F, H, W, 3).

@@ -26,7 +26,6 @@ from wm_nodes.video_model import (
     initial_noise,
     sample_videos,
 )
-from wm_nodes.video_rl.reference_reward import attach_rewards
 from wm_nodes.video_rl.sampling import sample_buffer
 
 CHANNELS, FRAMES, SIDE = 2, 6, 16
@@ -207,7 +206,7 @@ class ToyContexts:
     def score(self, request: SceneRequest, clips: RolloutBuffer) -> RolloutBuffer:
         """Return the buffer with every score of its videos, and as `total` the one that trains."""
         scores = score(clips.rollout.latents, request.scenes.rows(clips.group_ids)).named()
-        return attach_rewards(clips, scores, scores[self.reward])
+        return clips.with_rewards({**scores, "total": scores[self.reward]})
 
     def evaluate(self, scenes: Scenes) -> Scores:
         """Score one video of each scene, sampled by ODE."""

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from wm_nodes.config.video import VideoRlConfig
@@ -36,7 +35,7 @@ def context_scores(
 
     Where the model chooses the motion, how near it is to the recorded one says nothing, and is left out.
     """
-    contexts = evaluated_contexts(heldout, config)
+    contexts = heldout.first(config.evaluation.contexts)
     folder.network.eval()
     frames = sample_by_ode(folder, contexts, config, config.evaluation.num_steps)
     scores = all_scores(
@@ -44,11 +43,6 @@ def context_scores(
         load_execution_reward(config, folder, contexts, probe),
     )
     return {name: scores[name] for name in OUTCOMES if name in scores} if config.groups.hide_actions else scores
-
-
-def evaluated_contexts(heldout: Clips, config: VideoRlConfig) -> Clips:
-    """Return the first `evaluation.contexts` held-out contexts, or all where there are fewer."""
-    return heldout.select(torch.arange(min(config.evaluation.contexts, len(heldout))))
 
 
 def load_or_measure_scores(
