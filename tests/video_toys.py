@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
@@ -13,6 +14,7 @@ from torch.distributions import Normal
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import AdvantageConfig, GrpoConfig, KlConfig, MaskConfig, RolloutConfig, SamplerConfig
+from wm_nodes.core.types import FloatArray
 from wm_nodes.judge.one_class.ranges import load_ranges, save_ranges, strides_of
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.video_model import (
@@ -25,6 +27,7 @@ from wm_nodes.video_model import (
     initial_noise,
     sample_videos,
 )
+from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_rl.grpo import GrpoLearner
 
 ACTION_DIM = 2
@@ -54,6 +57,15 @@ def toy_condition(
         randn(count, max(0, frames - 1), ACTION_DIM, seed=seed + 2),
         randn(count, 3, text_dim, seed=seed + 3),
     )
+
+
+def toy_clips(
+    frames: Tensor, actions: Tensor, truth: FloatArray, instructions: tuple[str, ...] | None = None
+) -> Clips:
+    """Recordings of PushCube whose seeds and states say nothing."""
+    E, F = frames.shape[:2]
+    states = np.zeros((E, F, 3), np.float32)
+    return Clips(frames, actions, truth, instructions or ("push",) * E, "push_cube", tuple(range(E)), states)
 
 
 class Analytic(nn.Module):

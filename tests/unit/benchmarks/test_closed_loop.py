@@ -66,7 +66,7 @@ def folder(contexts: Clips) -> VideoFolder:
 
 def sampled(folder: VideoFolder, contexts: Clips, source: type[RecordedContexts] = RecordedContexts) -> RolloutBuffer:
     made = source(folder, contexts, CONFIG, PositionProbe(64, 128))
-    request = GroupRequest((0, 2), 3 if source is RecordedContexts else 1, 0, 0, True, 1)
+    request = GroupRequest((0, 2), 3 if source is RecordedContexts else 1, 0, 0, 1)
     return made.score(request, made.sample(request))
 
 

@@ -1,5 +1,7 @@
 """Videos made clip after clip, windows to learn that from, and videos whose actions are hidden."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -27,26 +29,26 @@ def counted(frames: int) -> tuple[Tensor, Tensor]:
 
 def test_a_clip_goes_on_from_the_last_frames_under_the_actions_from_there() -> None:
     videos, actions = counted(12)
-    condition = clip_condition(videos[:, :, :6], actions, torch.zeros(N, 1, 0), LENGTHS)
+    whole = Condition(videos[:, :, :1], actions, torch.zeros(N, 1, 0))
+    condition = clip_condition(videos[:, :, :6], whole, LENGTHS)
     assert condition.frames[0, 0, :, 0, 0].tolist() == [3, 4, 5]
     assert condition.actions[0, :, 0].tolist() == [3, 4, 5, 6], "from frame 3 to frame 7"
-    first = clip_condition(videos[:, :, :1], actions, torch.zeros(N, 1, 0), LENGTHS)
+    first = clip_condition(videos[:, :, :1], whole, LENGTHS)
     assert first.num_conditioning == 1 and first.actions[0, :, 0].tolist() == [0, 1]
     with pytest.raises(ValueError, match="2 frames after 11 need 12 actions, got 11"):
-        clip_condition(videos[:, :, :11], actions, torch.zeros(N, 1, 0), LENGTHS)
+        clip_condition(videos[:, :, :11], whole, LENGTHS)
 
 
 def test_a_video_is_continued_to_its_length_and_depends_on_what_came_before() -> None:
-    network, text = tiny_network(C), torch.zeros(N, 1, 0)
-    first, actions = randn(N, C, 1, SIDE, SIDE), randn(N, 5, ACTION_DIM)
-    settings = rollout_config(num_steps=2)
-    whole = continue_videos(network, first, actions, text, LENGTHS, 6, noise, settings)
+    network, settings, first = tiny_network(C), rollout_config(num_steps=2), randn(N, C, 1, SIDE, SIDE)
+    start = Condition(first, randn(N, 5, ACTION_DIM), torch.zeros(N, 1, 0))
+    whole = continue_videos(network, start, LENGTHS, 6, noise, settings)
     assert whole.shape == (N, C, 6, SIDE, SIDE) and torch.equal(whole[:, :, :1], first)
-    again = continue_videos(network, first, actions, text, LENGTHS, 6, noise, settings)
+    again = continue_videos(network, start, LENGTHS, 6, noise, settings)
     assert torch.equal(whole, again)
-    begun = continue_videos(network, first, actions, text, LENGTHS, 3, noise, settings)
+    begun = continue_videos(network, start, LENGTHS, 3, noise, settings)
     assert torch.equal(begun, whole[:, :, :3]), "later frames do not change earlier ones"
-    other = continue_videos(network, first + 1, actions, text, LENGTHS, 6, noise, settings)
+    other = continue_videos(network, replace(start, frames=first + 1), LENGTHS, 6, noise, settings)
     assert not torch.allclose(other[:, :, -1], whole[:, :, -1])
 
 

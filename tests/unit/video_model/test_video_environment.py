@@ -15,7 +15,7 @@ from wm_nodes.core.specs import SOURCE_IMAGINED, EnvironmentSpec
 from wm_nodes.core.types import FloatArray, StepResult, UInt8Array
 from wm_nodes.video_model import NetworkSettings, VideoNetwork, initial_noise
 from wm_nodes.video_model.codec import PatchCodec
-from wm_nodes.video_model.conditions import hashed_words
+from wm_nodes.video_model.conditions import Condition, hashed_words
 from wm_nodes.video_model.continuation import ClipLengths, continue_videos
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_model.video_environment import ROWS, VideoEnvironment, VideoEpisodes, check_steppable
@@ -94,11 +94,12 @@ def test_an_episode_is_the_model_going_on_from_its_own_last_frames() -> None:
         fresh = initial_noise((shape[0], 1, *shape[2:]), torch.tensor([stream_seed(seed, "video_step", clip)]))
         return torch.cat([torch.zeros(1, shape[0], shape[1] - 1, *shape[2:]), fresh], 2)
 
-    latents = continue_videos(
-        folder.network, folder.codec.encode(torch.from_numpy(first).unsqueeze(1)),
-        torch.from_numpy(np.stack(acted, 1)), hashed_words(("push cube",), 4), ClipLengths(4, 1), count + 1, noise,
-        rollout_config(num_steps=4, shift=3.0),
+    start = Condition(
+        folder.codec.encode(torch.from_numpy(first).unsqueeze(1)), torch.from_numpy(np.stack(acted, 1)),
+        hashed_words(("push cube",), 4),
     )
+    sampler = rollout_config(num_steps=4, shift=3.0)
+    latents = continue_videos(folder.network, start, ClipLengths(4, 1), count + 1, noise, sampler)
     expected = folder.codec.decode(latents)[0, 1:].numpy()
     assert np.abs(expected.astype(int) - np.stack(seen)).max() <= 1  # a batch of one rounds otherwise
     assert (np.diff(expected.astype(int), axis=0) != 0).any((1, 2, 3)).all()  # every frame is new

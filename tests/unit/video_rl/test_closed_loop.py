@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from video_toys import ACTION_DIM, randn, tiny_network
+from video_toys import ACTION_DIM, randn, tiny_network, toy_clips
 
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import VideoRlConfig
@@ -39,7 +39,7 @@ def recorded(frames: int = FRAMES) -> Clips:
     pictures = values.view(2, frames, 1, 1, 1).expand(2, frames, 8, 12, 3).to(torch.uint8)
     actions = randn(2, frames - 1, ACTION_DIM)
     truth = np.full((2, frames, len(GROUND_TRUTH_NAMES)), 0.1, np.float32)
-    return Clips(pictures, actions, truth, ("push", "pull"), "push_cube")
+    return toy_clips(pictures, actions, truth, ("push", "pull"))
 
 
 def make_folder(given: int = GIVEN, seed: int = 0) -> VideoFolder:
@@ -62,7 +62,7 @@ def make_source(config: VideoRlConfig = CONFIG, folder: VideoFolder | None = Non
 
 def test_a_group_goes_on_from_one_self_made_history_under_the_recorded_actions() -> None:
     source = make_source()
-    request = GroupRequest((1, 0), 3, 5, 0, True, history=2)
+    request = GroupRequest((1, 0), 3, 5, 0, history=2)
     buffer = source.sample(request)
     assert buffer.rollout.latents.shape == (6, 6, GIVEN + NEW, 2, 3)
     given = buffer.condition.frames.view(2, 3, 6, GIVEN, 2, 3)
@@ -79,7 +79,7 @@ def test_a_group_goes_on_from_one_self_made_history_under_the_recorded_actions()
 
 
 def test_the_history_is_of_the_weights_that_sample_and_equal_requests_give_equal_bytes() -> None:
-    request = GroupRequest((0, 1), 2, 1, 0, True, history=1)
+    request = GroupRequest((0, 1), 2, 1, 0, history=1)
     first, again, other = (make_source(folder=make_folder(seed=seed)).sample(request) for seed in (0, 0, 1))
     assert first.to_bytes() == again.to_bytes()
     assert not torch.equal(first.condition.frames, other.condition.frames)
@@ -159,7 +159,7 @@ def test_a_group_of_equal_clips_has_no_head_room_and_one_of_different_clips_what
         assert one.share == pytest.approx(0, abs=1e-6) and one.codec > one.reward
     source = make_source()
     for one in measure_headroom(folder, recorded(), CONFIG, probe):
-        request = GroupRequest((0, 1), 3, one.clips - 1, 0, True, one.clips - 1)
+        request = GroupRequest((0, 1), 3, one.clips - 1, 0, one.clips - 1)
         rewards = source.score(request, source.sample(request)).rewards["total"].view(2, 3)
         assert one.gain[0] == pytest.approx(float((rewards.amax(1) - rewards.mean(1)).mean())) and one.gain[0] > 0
         assert one.best - one.reward == pytest.approx(one.gain[0])

@@ -156,11 +156,12 @@ def measure_clips(
     distance of the last frames' object positions from their mean. reward, reward_std: of source.config.rewards.
     """
     rollout = sampler.rollout.with_values(micro_batch=source.config.rollout.micro_batch)
-    config = source.config.with_values(rollout=rollout)
+    groups = source.config.groups.with_values(shared_noise=sampler.shared_noise)
+    config = source.config.with_values(rollout=rollout, groups=groups)
     source = RecordedContexts(source.folder, source.contexts, config, source.probe)
     found: dict[str, list[float]] = {}
     for index in range(len(source.contexts)):
-        request = GroupRequest((index,), group_size, index, 0, sampler.shared_noise)
+        request = GroupRequest((index,), group_size, index, 0)
         buffer = source.score(request, source.sample(request))
         frames, K = source.folder.codec.decode(buffer.rollout.latents), buffer.condition.num_conditioning
         last = source.probe.read(frames[:, -1:])[:, 0][..., columns_of(source.contexts.task, "object")]

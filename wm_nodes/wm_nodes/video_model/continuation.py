@@ -31,38 +31,36 @@ class ClipLengths:
         return frames - given, given
 
 
-def clip_condition(videos: Tensor, actions: Tensor, text: Tensor, lengths: ClipLengths) -> Condition:
+def clip_condition(videos: Tensor, whole: Condition, lengths: ClipLengths) -> Condition:
     """Return the condition of the clip that goes on after `videos`: its last frames, and the actions from there.
 
     Args:
-        videos: the frames so far (N, C, F, h, w). actions: (N, F - 1 + n or more, A), from the first frame on; A = 0
-            where they are hidden.
+        videos: the frames so far (N, C, F, h, w). whole: of the whole videos, with F - 1 + n actions or more.
 
     Raises:
         ValueError: too few actions.
     """
     F = videos.shape[2]
     first, K = lengths.place(F)
-    wanted = actions[:, first : F - 1 + lengths.new]
+    wanted = whole.actions[:, first : F - 1 + lengths.new]
     if wanted.shape[1] != K - 1 + lengths.new:
-        raise ValueError(f"{lengths.new} frames after {F} need {F - 1 + lengths.new} actions, got {actions.shape[1]}")
-    return Condition(videos[:, :, first:].contiguous(), wanted.contiguous(), text)
+        got = whole.actions.shape[1]
+        raise ValueError(f"{lengths.new} frames after {F} need {F - 1 + lengths.new} actions, got {got}")
+    return Condition(videos[:, :, first:].contiguous(), wanted.contiguous(), whole.text)
 
 
 @torch.no_grad()
 def continue_videos(
-    model: VelocityModel, videos: Tensor, actions: Tensor, text: Tensor, lengths: ClipLengths, frames: int,
-    noise: ClipNoise, settings: RolloutConfig,
+    model: VelocityModel, whole: Condition, lengths: ClipLengths, frames: int, noise: ClipNoise,
+    settings: RolloutConfig,
 ) -> Tensor:
-    """Return `videos` (N, C, F, h, w) continued to `frames` frames, clip after clip by ODE; the last may be shorter.
-
-    Everything is where the model is; actions and text as in clip_condition. Raises ValueError as that.
-    """
+    """Return videos (N, C, frames, h, w) of `whole`, where the model is, clip after clip by ODE; the last clip may be
+    shorter. Raises ValueError as clip_condition."""
+    videos, clip = whole.frames, 0
     seeds = torch.zeros(len(videos), dtype=torch.int64)  # of step noise, of which an ODE has none
-    clip = 0
     while videos.shape[2] < frames:
         new = min(lengths.new, frames - videos.shape[2])
-        condition = clip_condition(videos, actions, text, ClipLengths(lengths.given, new))
+        condition = clip_condition(videos, whole, ClipLengths(lengths.given, new))
         shape = (videos.shape[1], condition.num_conditioning + new, *videos.shape[3:])
         rollout = sample_videos(model, condition, noise(clip, shape).to(videos.device), seeds, settings, [])
         videos = torch.cat([videos, rollout.latents[:, :, -new:]], 2)

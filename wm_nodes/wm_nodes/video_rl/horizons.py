@@ -3,7 +3,6 @@
 Shapes: E contexts, n clips of a group, F frames.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from torch import Tensor
@@ -54,9 +53,9 @@ def measure_headroom(
         strategy="all"
     ))
     source, n, found = RecordedContexts(folder, contexts, config, probe), config.groups.group_size, list[Headroom]()
-    plain = GroupRequest(tuple(range(len(contexts))), n, 0, 0, config.groups.shared_noise)
-    for history in _histories(folder, contexts):
-        request = replace(plain, history=history, iteration=history or 0)
+    made, lengths = contexts.frames.shape[1] - folder.clip["num_conditioning"], folder.lengths
+    for history in [None] if lengths is None else range(made // lengths.new):
+        request = GroupRequest(tuple(range(len(contexts))), n, history or 0, 0, history)
         buffer = source.score(request, source.sample(request))
         single = replace(request, group_size=1)
         coded = folder.codec.decode(folder.codec.encode(source.references(single).frames))
@@ -79,9 +78,3 @@ def horizon_scores(frames: Tensor, recorded: Clips, probe: PositionProbe, folder
         found |= {f"{name}_{clip}": scores[name] for name in DRIFT}
         first, clip = first + count, clip + 1
     return found
-
-
-def _histories(folder: VideoFolder, contexts: Clips) -> Sequence[int | None]:
-    if folder.lengths is None:
-        return [None]
-    return range((contexts.frames.shape[1] - folder.clip["num_conditioning"]) // folder.lengths.new)

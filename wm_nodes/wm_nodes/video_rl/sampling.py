@@ -37,8 +37,6 @@ class GroupRequest:
     """Of the learner."""
     policy_version: int
     """Of the weights that sample."""
-    shared_noise: bool = False
-    """One initial noise for all clips of a context."""
     history: int | None = None
     """Clips that the model makes one after the other before those of a group, which share them; None: the group's are
     of whole recordings."""
@@ -105,7 +103,7 @@ class RecordedContexts:
         if groups.history:  # from 0 on: without the first clips a model forgets how to make them
             history = int(numpy_stream(seed, "history", iteration).integers(groups.history + 1))
         contexts = tuple(int(i) for i in drawn)
-        return GroupRequest(contexts, groups.group_size, iteration, policy_version, groups.shared_noise, history)
+        return GroupRequest(contexts, groups.group_size, iteration, policy_version, history)
 
     def sample(
         self, request: GroupRequest, on_progress: Callable[[int, int], None] = lambda done, total: None
@@ -117,7 +115,7 @@ class RecordedContexts:
         group = torch.arange(len(request.contexts)).repeat_interleave(request.group_size)
         sample = torch.arange(request.group_size).repeat(len(request.contexts))
         seeds = _seeds(self.config.seed, "clip_steps", request.iteration, group, sample)
-        noises = torch.zeros_like(sample) if request.shared_noise else sample
+        noises = torch.zeros_like(sample) if self.config.groups.shared_noise else sample
         condition = self.condition(request)
         _, _, H, W, _ = self.contexts.frames.shape
         codec = self.folder.codec
@@ -141,9 +139,8 @@ class RecordedContexts:
             return initial_noise(shape, _seeds(self.config.seed, "history_noise", request.iteration, contexts, of))
 
         frames, settings = self._made(request.history), _ode(self.config, self.config.rollout.num_steps)
-        given = start.frames, start.actions, start.text
-        videos = continue_videos(self.folder.network, *given, lengths, frames, noise, settings)
-        return clip_condition(videos, start.actions, start.text, lengths).repeat_interleave(request.group_size)
+        videos = continue_videos(self.folder.network, start, lengths, frames, noise, settings)
+        return clip_condition(videos, start, lengths).repeat_interleave(request.group_size)
 
     def place(self, request: GroupRequest) -> tuple[int, int]:
         """Return where in the recordings the request's clips begin, and how many of their frames are given."""
@@ -196,8 +193,8 @@ def sample_by_ode(folder: VideoFolder, contexts: Clips, config: VideoRlConfig, n
         return initial_noise(shape, seeds).to(folder.device)
 
     K, count = condition.num_conditioning, contexts.frames.shape[1]
-    lengths, given = folder.lengths or ClipLengths(K, count - K), (condition.frames, condition.actions, condition.text)
-    videos = continue_videos(folder.network, *given, lengths, count, noise, _ode(config, num_steps))
+    lengths = folder.lengths or ClipLengths(K, count - K)
+    videos = continue_videos(folder.network, condition, lengths, count, noise, _ode(config, num_steps))
     return folder.codec.decode(videos)
 
 
