@@ -8,6 +8,7 @@ import pytest
 import torch
 from recording_samples import make_episode, make_spec
 from torch import Tensor
+from video_toys import toy_clips
 
 from wm_nodes.config.load import VIDEO, ConfigError, dump_config, load_video_config, preset_names, reward_overrides
 from wm_nodes.core.model_folder import ModelFolderError
@@ -101,7 +102,7 @@ def recorded(positions_cm: Tensor) -> Clips:
     truth = np.zeros((N, F, len(GROUND_TRUTH_NAMES)), np.float32)
     for index, name in enumerate(position_names("push_cube")):
         truth[..., GROUND_TRUTH_NAMES.index(name.replace("object", "cube"))] = positions_cm[..., index].numpy() / 100
-    return Clips(frames, torch.zeros(N, F - 1, 6), truth, ("push",) * N, "push_cube")
+    return toy_clips(frames, torch.zeros(N, F - 1, 6), truth)
 
 
 def test_a_clip_equal_to_its_recording_has_full_scores_and_a_shifted_object_loses_by_the_formula() -> None:
@@ -135,7 +136,7 @@ def pictures_of(frames: Tensor) -> Clips:
     """Recordings (N, F) that show these frames and have no simulator state."""
     N, F = frames.shape[:2]
     truth = np.full((N, F, len(GROUND_TRUTH_NAMES)), np.nan, np.float32)
-    return Clips(frames, torch.zeros(N, F - 1, 6), truth, ("push",) * N, "push_cube")
+    return toy_clips(frames, torch.zeros(N, F - 1, 6), truth)
 
 
 def test_closeness_is_the_mean_of_psnr_ssim_and_the_perceptual_score_of_the_generated_frames() -> None:

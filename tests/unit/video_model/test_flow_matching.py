@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from torch import Tensor
-from video_toys import ACTION_DIM, randn, times, tiny_network
+from video_toys import ACTION_DIM, randn, times, tiny_network, toy_clips
 
 from wm_nodes.config.load import load_video_config
 from wm_nodes.core.seeding import torch_stream
@@ -108,7 +108,7 @@ def test_a_trained_model_obeys_its_actions_and_without_them_knows_only_the_mean(
 def contexts(count: int, height: int, width: int) -> Clips:
     frames = torch.randint(0, 256, (count, 3, height, width, 3), generator=torch_stream(0, "pixels"), dtype=torch.uint8)
     truth = torch.zeros(count, 3, len(GROUND_TRUTH_NAMES)).numpy()
-    return Clips(frames, torch.zeros(count, 2, ACTION_DIM), truth, ("push",) * count, "push_cube")
+    return toy_clips(frames, torch.zeros(count, 2, ACTION_DIM), truth)
 
 
 @pytest.mark.parametrize(("height", "width"), [(8, 12), (16, 24), (20, 8)])

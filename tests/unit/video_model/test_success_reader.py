@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from video_toys import toy_clips
 
 from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
@@ -28,7 +29,7 @@ def recorded(count: int, seed: int) -> tuple[Clips, np.ndarray]:  # type: ignore
     frames[done, :, :16] += 100
     truth = np.zeros((count, 3, len(GROUND_TRUTH_NAMES)), np.float32)
     truth[..., GROUND_TRUTH_NAMES.index("goal_x")] = np.where(done, 0, 1)
-    return Clips(torch.from_numpy(frames), torch.zeros(count, 2, 1), truth, ("",) * count, "push_cube"), done
+    return toy_clips(torch.from_numpy(frames), torch.zeros(count, 2, 1), truth), done
 
 
 def test_a_reader_learns_from_labels_and_comes_back_from_its_folder_as_it_was(tmp_path: Path) -> None:

@@ -136,7 +136,6 @@ def test_a_path_begins_at_the_recorded_state_and_a_jump_is_cut_to_the_arms_reach
     reward = made(clips)
     assert reward.reach_m == pytest.approx(0.02, abs=1e-6)
     np.testing.assert_allclose(reward.correction, [*np.eye(3), [0.6, 0, 0]], atol=2e-3)
-    assert clips.states is not None
     np.testing.assert_allclose(reward.paths(clips.frames, clips), clips.states, atol=3e-3)
     jump = clips.ground_truth[..., TOOL].copy()
     jump[:, 4:] += (0, 0.1, 0)
@@ -191,14 +190,12 @@ def test_clips_that_do_not_begin_with_a_recorded_frame_and_its_state_are_refused
         made(clips, num_conditioning=0)
     with pytest.raises(ValueError, match="recordings with simulator state"):
         made(replace(clips, ground_truth=np.full_like(clips.ground_truth, np.nan)))
-    assert clips.states is not None
     astray = clips.states.copy()
     astray[3, 0, 1] += 0.05
     with pytest.raises(ValueError, match=r"recording 3 begins 5.0 cm from where its first state has the tool"):
         made(replace(clips, states=astray))
-    for unknown in ({"states": None}, {"spec": None}):
-        with pytest.raises(ValueError, match="from bags"):
-            load(replace(clips, **unknown))
+    with pytest.raises(ValueError, match="from bags"):
+        load(replace(clips, spec=None))
     with pytest.raises(ConfigError, match=r"set rewards.execution 0, or groups.history 0"):
         load_video_config("closed_loop", {"rewards": {"execution": 1.0}})
 

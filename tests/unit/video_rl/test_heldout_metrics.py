@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from video_toys import toy_clips
 
 from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.config.seed_ranges import HELDOUT
@@ -45,7 +46,7 @@ def test_the_correction_undoes_a_shrunk_and_shifted_height() -> None:
 def test_every_metric_of_a_clip_is_a_number_and_the_other_reader_looks_at_the_last_frame() -> None:
     frames = torch.randint(0, 255, (3, 4, 64, 128, 3), dtype=torch.uint8, generator=torch.manual_seed(0))
     truth = np.zeros((3, 4, len(GROUND_TRUTH_NAMES)), np.float32)
-    clips = Clips(frames, torch.zeros(3, 3, 6), truth, ("",) * 3, "push_cube")
+    clips = toy_clips(frames, torch.zeros(3, 3, 6), truth)
     reader = SuccessReader(64, 128)
     reader.threshold = float(np.median(reader.read(frames[:, -1])))
     probe = PositionProbe(64, 128)

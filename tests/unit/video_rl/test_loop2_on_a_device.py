@@ -19,7 +19,7 @@ from model_folders import make_model_folder
 from pretended_device import Device
 from torch import Tensor
 from torch.testing import assert_close
-from video_toys import ACTION_DIM, tiny_network, toy_buffer, toy_rollout_settings
+from video_toys import ACTION_DIM, tiny_network, toy_buffer, toy_clips, toy_rollout_settings
 
 from benchmarks.video_rl.cost import toy_rollout
 from benchmarks.video_rl.discs import training_batch
@@ -189,7 +189,7 @@ def clips(count: int, seed: int, height: int = 16, width: int = 32) -> Clips:
     frames = torch.randint(0, 256, (count, 3, height, width, 3), generator=generator, dtype=torch.uint8)
     actions = torch.randn(count, 2, ACTION_DIM, generator=generator)
     truth = torch.rand(count, 3, len(GROUND_TRUTH_NAMES), generator=generator).numpy()
-    return Clips(frames, actions, truth, ("push the cube",) * count, "push_cube")
+    return toy_clips(frames, actions, truth, ("push the cube",) * count)
 
 
 def probe_on(device: str, height: int = 16, width: int = 32) -> PositionProbe:

@@ -35,10 +35,10 @@ class Clips:
     """One each."""
     task: str
     """Of all of them."""
-    seeds: tuple[int, ...] = ()
-    """Of the simulator's reset, one each; () where unknown."""
-    states: FloatArray | None = None
-    """(E, F, S) of the tool; None where unknown."""
+    seeds: tuple[int, ...]
+    """Of the simulator's reset, one each."""
+    states: FloatArray
+    """(E, F, S) of the tool."""
     spec: EnvironmentSpec | None = None
     """Of the environment that was recorded; None where unknown."""
 
@@ -49,8 +49,7 @@ class Clips:
         return Clips(
             self.frames[index], self.actions[index], self.ground_truth[index.numpy()],
             tuple(self.instructions[int(i)] for i in index), self.task,
-            tuple(self.seeds[int(i)] for i in index) if self.seeds else (),
-            None if self.states is None else self.states[index.numpy()], self.spec,
+            tuple(self.seeds[int(i)] for i in index), self.states[index.numpy()], self.spec,
         )
 
     def first(self, count: int) -> "Clips":
@@ -58,9 +57,7 @@ class Clips:
         return self.select(torch.arange(min(count, len(self))))
 
     def first_states(self) -> FloatArray:
-        """The states (E, S) that the clips begin with. Raises ValueError where they are unknown."""
-        if self.states is None:
-            raise ValueError("these clips have no states of the tool; load them from bags")
+        """The states (E, S) that the clips begin with."""
         return np.ascontiguousarray(self.states[:, 0])
 
     def window(self, first: int, frames: int) -> "Clips":
@@ -74,8 +71,7 @@ class Clips:
             raise ValueError(f"recordings of {self.frames.shape[1]} frames have no frames {first} to {last - 1}")
         return replace(
             self, frames=self.frames[:, first:last], actions=self.actions[:, first : last - 1],
-            ground_truth=self.ground_truth[:, first:last],
-            states=None if self.states is None else self.states[:, first:last],
+            ground_truth=self.ground_truth[:, first:last], states=self.states[:, first:last],
         )
 
     def condition(self, codec: Codec, num_conditioning: int, text_dim: int) -> Condition:

@@ -103,7 +103,7 @@ def accepted_episodes(reward: ExecutionReward, frames: Tensor, references: Clips
             ground_truth=np.zeros((steps + 1, 0), np.float32), success=np.arange(steps + 1) == steps,
             rewards=np.full(steps, np.nan, np.float32), terminated=True, truncated=False, task=references.task,
             instruction=references.instructions[row], behaviour=BEHAVIOUR,
-            seed=references.seeds[row] if references.seeds else 0, episode_id=0, source=SOURCE_IMAGINED,
+            seed=references.seeds[row], episode_id=0, source=SOURCE_IMAGINED,
             extra={"done_signal": float(signals_NT[row, steps - 1])},
         ))
     return episodes
