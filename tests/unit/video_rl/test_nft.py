@@ -1,5 +1,6 @@
 """DiffusionNFT (DD-31) against its formula in numpy, its limits, and the learner's contracts with it."""
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +29,7 @@ from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import GrpoConfig
 from wm_nodes.reports.clip_report import clip_panels
 from wm_nodes.reports.curves import curves
+from wm_nodes.training import checkpoint
 from wm_nodes.training.metrics import FILE_NAME, read_metrics
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.video_model import RolloutBuffer
@@ -308,6 +310,22 @@ def test_a_checkpoint_of_the_other_objective_is_refused(tmp_path: Path) -> None:
         one.save(tmp_path / "state")
         with pytest.raises(ValueError, match=r"another grpo\.objective; resume with its settings"):
             other.load(tmp_path / "state")
+
+
+def test_a_checkpoint_with_the_old_weights_and_without_its_objective_is_still_continued(tmp_path: Path) -> None:
+    learner, resumed, path = make(), make(tiny_network(seed=9)), tmp_path / "state"
+    train_rounds(learner, range(1))
+    learner.save(path)
+    tensors, metadata = checkpoint.read_checkpoint(path)
+    header = json.loads(metadata["grpo"])
+    del header["objective"]
+    parts = {part: checkpoint.section(tensors, f"{part}.") for part in ("model", "optimizer")}
+    checkpoint.write_checkpoint(path, {**parts, "old": parts["model"]}, {"grpo": json.dumps(header)})
+    resumed.load(path)
+    for one in (learner, resumed):
+        train_rounds(one, range(1, 2))
+    for name, value in weights(learner.model).items():
+        assert torch.equal(value, weights(resumed.model)[name]), name
 
 
 @pytest.mark.parametrize("changes", STATEFUL)

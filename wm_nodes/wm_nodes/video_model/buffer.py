@@ -128,7 +128,12 @@ class RolloutBuffer:
             header = json.loads(metadata_of(data)[_METADATA_KEY])
             for name, values in tensors.items():
                 if name.startswith("condition.") or name.removeprefix("rollout.") in ROWS:
-                    _check_finite(name, values)
+                    finite = torch.isfinite(values).flatten(1).all(1)
+                    if not finite.all():
+                        raise RolloutBufferError(
+                            f"video {int(finite.int().argmin())} of the buffer has a value in {name} that is no "
+                            "number; lower the learning rate, or begin with other weights"
+                        )
             return cls(
                 VideoRollout(**section(tensors, "rollout."), steps=tuple(header["steps"])),
                 Condition(**section(tensors, "condition.")), tensors["group_ids"], tensors["sample_ids"],
@@ -138,12 +143,3 @@ class RolloutBuffer:
             raise RolloutBufferError(
                 f"these {len(data)} bytes are no complete rollout buffer ({error}); sample again"
             ) from error
-
-
-def _check_finite(name: str, values: Tensor) -> None:
-    if not bool(torch.isfinite(values).all()):
-        video = int((~torch.isfinite(values)).flatten(1).any(1).nonzero()[0])
-        raise RolloutBufferError(
-            f"video {video} of the buffer has a value in {name} that is no number; lower the learning rate, or begin "
-            "with other weights"
-        )

@@ -37,8 +37,8 @@ class PatchCodec(nn.Module):
         self.register_buffer("scale", torch.ones(channels))
 
     def settings(self) -> dict[str, Any]:
-        """Return the arguments of __init__, as JSON."""
-        return {"patch": self.patch, "channels": self.channels}
+        """Return the kind and the arguments of __init__, as JSON."""
+        return {"kind": "patch", "patch": self.patch, "channels": self.channels}
 
     @torch.no_grad()
     def fit(self, frames: Tensor) -> float:

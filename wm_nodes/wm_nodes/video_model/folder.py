@@ -29,7 +29,6 @@ from wm_nodes.video_model.tokenizer_codec import Codec, TokenizerCodec, codec_of
 
 CODEC, NETWORK = "codec.safetensors", "network.safetensors"
 FORMAT = 2
-KINDS = {PatchCodec: "patch", TokenizerCodec: "tokenizer"}
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ def save_video_folder(
     """Write the folder; the manifest, which names the files' sha256, comes last."""
     packed = {CODEC: pack_weights(codec), NETWORK: pack_weights(network)}
     manifest = {
-        "format": FORMAT, "codec": {"kind": KINDS[type(codec)], **codec.settings()},
+        "format": FORMAT, "codec": codec.settings(),
         "network": asdict(network.settings), "clip": dict(clip),
         "sha256": {name: weights.sha256 for name, weights in packed.items()}, **story,
     }

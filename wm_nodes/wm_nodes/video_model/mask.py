@@ -35,11 +35,11 @@ def dynamic_mask(x0_BCFHW: Tensor, num_conditioning: int, settings: MaskConfig) 
     intensity = residual(x0, num_conditioning).square_().mean(1, keepdim=True).sqrt_()
     peak = intensity.flatten(1).amax(1)
     rms = torch.linalg.vector_norm(x0, dim=(1, 2, 3, 4)) / (C * F * H * W) ** 0.5
-    still = _rows((peak <= STATIC_SHARE * rms).float())
+    still = (peak <= STATIC_SHARE * rms).float().view(-1, 1, 1, 1, 1)
     normalised = (intensity.reshape(B, -1) / peak.clamp_min(_TINY).unsqueeze(1)).reshape(intensity.shape)
     threshold = quantile(normalised.flatten(1), settings.quantile)
     threshold = threshold.clamp_min(_LEAST_NORMAL)  # one of 0 would call still cells dynamic
-    prior = torch.ge(normalised, _rows(threshold), out=torch.empty_like(normalised))
+    prior = torch.ge(normalised, threshold.view(-1, 1, 1, 1, 1), out=torch.empty_like(normalised))
     level = prior.clone() if settings.combine == "sparse" else normalised * prior
     mask = level.mul_(1 - settings.m_min).add_(settings.m_min)
     if settings.budget == "rms":
@@ -74,7 +74,3 @@ def quantile(values_BU: Tensor, q: float) -> Tensor:
     neighbours = upper.topk(min(2, U - below), 1, largest=False).values.view(torch.float32)
     low, high = neighbours[:, 0], neighbours[:, -1]
     return low if position == below else low + (position - below) * (high - low)
-
-
-def _rows(values_B: Tensor) -> Tensor:
-    return values_B.view(-1, 1, 1, 1, 1)

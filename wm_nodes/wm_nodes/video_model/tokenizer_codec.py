@@ -36,8 +36,9 @@ class TokenizerCodec(nn.Module):
         self.channels, self.patch = config.latent_dim, config.patch_px
 
     def settings(self) -> dict[str, Any]:
-        """Return the arguments of __init__, as JSON."""
-        return {"config": self.config.model_dump(), "height": self.tokenizer.height, "width": self.tokenizer.width}
+        """Return the kind and the arguments of __init__, as JSON."""
+        size = {"height": self.tokenizer.height, "width": self.tokenizer.width}
+        return {"kind": "tokenizer", "config": self.config.model_dump(), **size}
 
     def encode(self, frames: Tensor) -> Tensor:
         """Return latents (B, C, F, h, w) of uint8 frames (B, F, H, W, 3).

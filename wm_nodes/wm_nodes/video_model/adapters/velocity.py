@@ -82,16 +82,13 @@ class PublicVelocity(nn.Module, ABC):
     @contextmanager
     def disable_adapter(self) -> Iterator[None]:
         """The base model, for a while: what kl.anchor lora_off compares with."""
-        layers = tuner_layers(self)
-        if not layers:
+        if not has_lora(self):
             raise ValueError("this model has no LoRA adapter; call add_lora, or take kl.anchor frozen")
-        for layer in layers:
-            layer.enable_adapters(False)
+        self.transformer.disable_adapters()
         try:
             yield
         finally:
-            for layer in layers:
-                layer.enable_adapters(True)
+            self.transformer.enable_adapters()
 
     def _text(self, condition: Condition, drop: Tensor | None) -> Tensor:
         """Text of every row, the null text where it is dropped, (B, L, E)."""
@@ -111,12 +108,8 @@ class PublicVelocity(nn.Module, ABC):
         return torch.where(drop.to(text.device).view(-1, 1, 1), self.null_text.to(text), text)
 
 
-def tuner_layers(model: nn.Module) -> list[Any]:
-    """The layers of `model` that carry a LoRA; none without the peft package."""
-    if not any("lora_" in name for name, _ in model.named_parameters()):
-        return []
-    base = package("peft.tuners.tuners_utils").BaseTunerLayer
-    return [module for module in model.modules() if isinstance(module, base)]
+def has_lora(model: nn.Module) -> bool:
+    return any("lora_" in name for name, _ in model.named_parameters())
 
 
 def add_lora(model: PublicVelocity, rank: int, alpha: float | None = None, *, seed: int = 0) -> None:
@@ -128,7 +121,7 @@ def add_lora(model: PublicVelocity, rank: int, alpha: float | None = None, *, se
     """
     if rank < 1:
         raise ValueError(f"lora.rank must be >= 1, got {rank}")
-    if tuner_layers(model):
+    if has_lora(model):
         raise ValueError("this model has a LoRA adapter already")
     config = package("peft").LoraConfig(
         r=rank, lora_alpha=rank if alpha is None else alpha, target_modules=list(TARGETS), lora_dropout=0.0
@@ -144,6 +137,6 @@ def add_lora(model: PublicVelocity, rank: int, alpha: float | None = None, *, se
 
 def save_lora(model: PublicVelocity, folder: Path) -> None:
     """Write the adapter as safetensors that diffusers' pipelines load too (load_lora_adapter)."""
-    if not tuner_layers(model):
+    if not has_lora(model):
         raise ValueError("this model has no LoRA adapter to save")
     model.transformer.save_lora_adapter(folder, safe_serialization=True)
