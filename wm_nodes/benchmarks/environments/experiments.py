@@ -28,26 +28,19 @@ from wm_nodes.core.device import compute_device
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.statistics import bootstrap_mean
 from wm_nodes.environments.registry import make_environment
-from wm_nodes.policy_rl.factories import make_policy
+from wm_nodes.policy_rl.factories import load_policy, make_policy
 from wm_nodes.policy_rl.validation.evaluation import evaluate
 from wm_nodes.reports.console_table import make_table
-from wm_nodes.training.weights import load_weights_file
 
 
 @dataclass(kw_only=True)
-class InModels(Experiment):
-    """An experiment on models as the environment of a policy; the task's world model is always the first of them."""
+class Configured(Experiment):
+    """An experiment that takes the policy settings as options."""
 
-    video_models: tuple[Path, ...] = ()
-    """Folders of video models that can be stepped."""
     preset: str = "cpu"
     """Of the settings: a name, or a .yaml."""
-    task: str = "push_cube"
-    """Of the policies."""
     model_dir: Path | None = None
     """World model instead of the shipped one."""
-    work: Path = Path("runs/environments")
-    """Folder of first frames and policies; what is there is kept."""
 
     @classmethod
     def add_settings(cls, parser: argparse.ArgumentParser) -> None:
@@ -57,6 +50,18 @@ class InModels(Experiment):
     @classmethod
     def settings_of(cls, arguments: argparse.Namespace) -> dict[str, Any]:
         return options.settings(arguments)
+
+
+@dataclass(kw_only=True)
+class InModels(Configured):
+    """An experiment on models as the environment of a policy; the task's world model is always the first of them."""
+
+    video_models: tuple[Path, ...] = ()
+    """Folders of video models that can be stepped."""
+    task: str = "push_cube"
+    """Of the policies."""
+    work: Path = Path("runs/environments")
+    """Folder of first frames and policies; what is there is kept."""
 
     @property
     def models(self) -> list[str]:
@@ -128,27 +133,16 @@ class Ranking(InModels):
 
 
 @dataclass(kw_only=True)
-class Measured(Experiment):
+class Measured(Configured):
     """Measure a policy in evaluation.environment: success, and of each of gymnasium.measures the largest in an episode.
     """
 
-    preset: str
-    """Of the settings: a name, or a .yaml."""
     task: str = ""
     """Of the environment; empty for one of your own."""
     model_dir: Path | None = None
     """World model whose tokenizer the policy sees by; without, policy.factory makes it."""
     weights: Path | None = None
     """The policy's; without, as it is made."""
-
-    @classmethod
-    def add_settings(cls, parser: argparse.ArgumentParser) -> None:
-        options.add_settings(parser)
-        options.add_device(parser)
-
-    @classmethod
-    def settings_of(cls, arguments: argparse.Namespace) -> dict[str, Any]:
-        return options.settings(arguments)
 
     def run(self) -> None:
         config, rows = load_config(self.preset, {"task": self.task, **self.settings}), self.read()
@@ -165,9 +159,8 @@ class Measured(Experiment):
         ]))
 
     def _measured(self, config: RunConfig) -> dict[str, Any]:
-        how, policy = config.evaluation, make_policy(config, self.model_dir)
-        if self.weights:
-            load_weights_file(policy, self.weights)
+        how, model = config.evaluation, self.model_dir
+        policy = load_policy(config, model, self.weights) if self.weights else make_policy(config, model)
         with (
             closing(make_environment(config, how.environment, num_envs=SIMULATOR_ENVS, seed=config.seed)) as env,
             tqdm(total=how.episodes, desc="episodes", unit="episode") as bar,

@@ -149,8 +149,8 @@ def make_learner(policy: ImagePolicy, config: RunConfig, ranks: Ranks | None = N
     return PpoLearner(policy, config.ppo, seed=config.seed, ranks=ranks)
 
 
-def load_policy(config: RunConfig, model_dir: Path, weights: Path) -> ImagePolicy:
-    """Return a policy with weights from a file.
+def load_policy(config: RunConfig, model_dir: Path | None, weights: Path) -> ImagePolicy:
+    """Return the policy of make_policy with weights from a file.
 
     Raises:
         ValueError: the weights belong to another architecture or to another tokenizer.
