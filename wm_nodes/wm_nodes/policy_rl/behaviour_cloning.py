@@ -38,8 +38,11 @@ class _Frames:
     """What is learned from; a row per image."""
 
     features_BF: Tensor
+    """The encoder's."""
     states_BS: Tensor
+    """Seen with them."""
     actions_BA: Tensor
+    """Demonstrated there."""
 
     def error(self, policy: ImagePolicy, rows: Tensor | slice = slice(None)) -> Tensor:
         """Mean squared error of the actor's mean."""
