@@ -147,7 +147,7 @@ class Measured(Configured):
     def run(self) -> None:
         config, rows = load_config(self.preset, {"task": self.task, **self.settings}), self.read()
         policy = str(self.weights or config.policy.factory or "untrained")
-        wanted = {"policy": policy, "config": config.model_dump(mode="json")}
+        wanted: dict[str, Any] = {"policy": policy, "config": config.model_dump(mode="json")}
         if not is_finished(rows, wanted):
             rows.append({**wanted, **self._measured(config)})
             self.write({"rows": rows}, device=config.device)
@@ -156,6 +156,7 @@ class Measured(Configured):
             (row["policy"], f"{row['successes']} of {row['episodes']}", f"{row['low']:.3f} to {row['high']:.3f}",
              *("{:.3f} ({:.3f} to {:.3f})".format(*row["measures"][name]) for name in config.gymnasium.measures))
             for row in rows
+            if all(row["config"][part] == wanted["config"][part] for part in ("gymnasium", "evaluation"))
         ]))
 
     def _measured(self, config: RunConfig) -> dict[str, Any]:

@@ -35,6 +35,7 @@ the spec of the environment, of its recordings or of the model that was trained 
 ScenesName = Annotated[str, AfterValidator(check_scenes)]
 """Name of a split or of a scene, see config/scenes.py."""
 PolicyInputs = Literal["latents", "positions", "both"]
+"""What a policy sees of a picture, see PolicyConfig.inputs."""
 DeviceName = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 """Where models compute: cpu, cuda, cuda:N, or auto (a GPU where there is one), see core/device.py."""
 
