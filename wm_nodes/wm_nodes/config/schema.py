@@ -230,6 +230,8 @@ class PolicyConfig(SettingsSection):
     """Commanded angles are divided by it."""
     factory: FactoryName = ""
     """module:callable(config) -> ImagePolicy instead of the one that sees by the tokenizer; empty: none."""
+    checkpoint: str = ""
+    """Folder of an OpenVLA checkpoint, as published, to be the policy instead (policy_rl/openvla); empty: none."""
 
 
 class LearnerConfig(SettingsSection):
@@ -253,6 +255,8 @@ class SftConfig(SettingsSection):
     the last gradient step."""
     bags: list[str] = Field(default=[])
     """Recordings whose successful episodes are the demonstrations, whoever acted; empty: MPLib plans them."""
+    scenes: ScenesName = ""
+    """Where MPLib plans them, as simulation.scenes; empty: there."""
 
 
 class PpoConfig(SettingsSection):
@@ -368,4 +372,5 @@ class RunConfig(SettingsSection):
     def _check_scenes(self) -> Self:
         if self.task:
             instruction(self.task, self.simulation.scenes)
+            instruction(self.task, self.sft.scenes or self.simulation.scenes)
         return self

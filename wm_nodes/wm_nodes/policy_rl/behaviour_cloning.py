@@ -4,6 +4,7 @@ import copy
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -26,7 +27,7 @@ class SftResult:
     """What a training gave."""
 
     losses: NDArray[np.float32]
-    """Mean squared action error of every gradient step's batch."""
+    """ImagePolicy.cloning_error of every gradient step's batch."""
     num_samples: int
     """Images trained on."""
     heldout_losses: Mapping[int, float]
@@ -45,9 +46,8 @@ class _Frames:
     """Demonstrated there."""
 
     def error(self, policy: ImagePolicy, rows: Tensor | slice = slice(None)) -> Tensor:
-        """Mean squared error of the actor's mean."""
-        mean_BA = policy.distribution(self.features_BF[rows], self.states_BS[rows]).mean_BA
-        return (mean_BA - self.actions_BA[rows]).square().mean()
+        """See ImagePolicy.cloning_error."""
+        return policy.cloning_error(self.features_BF[rows], self.states_BS[rows], self.actions_BA[rows])
 
 
 def demonstrations(episodes: Iterable[Episode], count: int) -> list[Episode]:
@@ -98,14 +98,14 @@ def train_sft(
     )
     generator, hiding = torch_stream(seed, "sft"), torch_stream(seed, "sft_dropout")
     dropout, losses, errors = policy.config.dropout, list[Tensor](), dict[int, float]()
-    best = copy.deepcopy(policy.actor.state_dict())
+    best, actor = copy.deepcopy(policy.state_dict()), cast(Any, policy.actor)
     for step in range(1, config.num_iterations + 1):
         index = torch.randint(len(learned.features_BF), (config.batch_size,), generator=generator).to(policy.device)
         if dropout:
             draws = torch.rand(config.batch_size, policy.config.projection, generator=hiding)
-            policy.actor.kept = (draws >= dropout).float().to(policy.device) / (1 - dropout)
+            actor.kept = (draws >= dropout).float().to(policy.device) / (1 - dropout)
         loss = learned.error(policy, index)
-        policy.actor.kept = None
+        actor.kept = None
         optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
@@ -114,9 +114,9 @@ def train_sft(
             with torch.no_grad():
                 errors[step] = float(heldout.error(policy))
             if errors[step] == min(errors.values()):
-                best = copy.deepcopy(policy.actor.state_dict())
+                best = copy.deepcopy(policy.state_dict())
     if heldout:
-        policy.actor.load_state_dict(best)
+        policy.load_state_dict(best)
     return SftResult(torch.stack(losses).cpu().numpy(), len(learned.features_BF), errors)
 
 

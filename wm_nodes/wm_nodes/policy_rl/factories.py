@@ -95,15 +95,19 @@ def run_spec(config: RunConfig, model_dir: Path) -> EnvironmentSpec:
 
 
 def make_policy(config: RunConfig, model_dir: Path | None) -> ImagePolicy:
-    """Return a policy with fresh weights: that of policy.factory, else one for run_spec, whose measured states are
-    shifted and scaled by what was recorded.
+    """Return a policy with fresh weights: that of policy.factory or policy.checkpoint, else one for run_spec, whose
+    measured states are shifted and scaled by what was recorded.
 
     Raises:
-        ValueError: neither a factory nor a model.
+        ValueError: neither a factory nor a checkpoint nor a model.
     """
     if config.policy.factory:
         made: ImagePolicy = load_factory(config.policy.factory)(config)
         return made.to(compute_device(config.device))
+    if config.policy.checkpoint:
+        from wm_nodes.policy_rl import openvla
+
+        return openvla.make_policy(config)
     if model_dir is None:
         raise ValueError(f"a policy sees by a world model's tokenizer; name a model's folder, or policy.factory, e.g. "
                          f"{UNTRAINED}")

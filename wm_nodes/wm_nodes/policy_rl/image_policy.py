@@ -85,6 +85,9 @@ class ImagePolicy(nn.Module):
         state_range: shift and scale of each value of the state (S,); None: it is taken as it is.
     """
 
+    actor: nn.Module
+    critic: nn.Module
+
     def __init__(
         self, encoder: ImageEncoder, state_dim: int, action_dim: int, config: PolicyConfig, *, seed: int = 0,
         state_range: tuple[Sequence[float], Sequence[float]] | None = None,
@@ -142,6 +145,10 @@ class ImagePolicy(nn.Module):
     def distribution(self, features_BF: Tensor, states_BS: Tensor) -> DiagonalGaussian:
         """Return the action distribution; the mean is not squashed."""
         return DiagonalGaussian(self.actor(*self._normalise(features_BF, states_BS)), self.log_std_A)
+
+    def cloning_error(self, features_BF: Tensor, states_BS: Tensor, actions_BA: Tensor) -> Tensor:
+        """What behaviour cloning makes small (RS-11): the mean squared error of the mean."""
+        return (self.distribution(features_BF, states_BS).mean_BA - actions_BA).square().mean()
 
     def value(self, features_BF: Tensor, states_BS: Tensor) -> Tensor:
         """Return the critic's values, (B,)."""
