@@ -73,13 +73,13 @@ class Workplace:
         return make(self.config, folder, self.start[0], num_envs=count, seed=self.config.seed)
 
     @contextmanager
-    def simulator(self, scenes: str = "") -> Iterator[Environment]:
+    def simulator(self, scenes: str = "", num_envs: int = SIMULATOR_ENVS) -> Iterator[Environment]:
         """scenes: others than the configuration's."""
         from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 
         config = self.config
         simulation = config.simulation.with_values(scenes=scenes or config.simulation.scenes)
-        env = ManiSkillEnvironment(config.task, simulation, SIMULATOR_ENVS, seed=config.seed)
+        env = ManiSkillEnvironment(config.task, simulation, num_envs, seed=config.seed)
         try:
             yield env
         finally:
@@ -88,7 +88,7 @@ class Workplace:
     def real(self, policy: ImagePolicy, scenes: str = "") -> EvaluationResult:
         """Success in the simulator, on the seeds of the configuration. scenes: others than the configuration's."""
         how = self.config.evaluation
-        with self.simulator(scenes) as env:
+        with self.simulator(scenes, min(SIMULATOR_ENVS, how.episodes)) as env:
             return evaluate(policy, env, how.episodes, how.first_seed, how.deterministic)
 
     def acceptance(
@@ -132,7 +132,7 @@ def train_in(
     accepted = None if model == SIMULATOR else workplace.acceptance(model, policy, before[1], before[0])
     elsewhere = {name: [workplace.real(policy, name)] for name in scenes}
     course, kept, seconds = list[float](), list[str](), time.monotonic()
-    for update, success_rate in enumerate(_training(workplace, model, policy, env), 1):
+    for update, success_rate in enumerate(train_on(workplace, policy, None if model == SIMULATOR else env), 1):
         course.append(success_rate)
         if update % KEPT_EVERY == 0 or update == config.ppo.updates:
             path = workplace.folder / Path(model).name / f"policy_{update:06d}.safetensors"
@@ -148,11 +148,11 @@ def train_in(
         "acceptance": {} if accepted is None else accepted.to_dict(),
         "model_sha256": env.spec.world_model_sha256, "task": config.task, "seed": config.seed,
         "updates": config.ppo.updates, "advantage": config.ppo.advantage, "course": course, "policies": kept,
-        "real_before": _rate(before[0]), "real_after": _rate(after[0]),
-        "imagined_before": _rate(before[1]), "imagined_after": _rate(after[1]),
+        "real_before": rate_of(before[0]), "real_after": rate_of(after[0]),
+        "imagined_before": rate_of(before[1]), "imagined_after": rate_of(after[1]),
         "real_gain": _gain(before[0], after[0]),
         "elsewhere": {
-            name: {"before": _rate(first), "after": _rate(last), "gain": _gain(first, last)}
+            name: {"before": rate_of(first), "after": rate_of(last), "gain": _gain(first, last)}
             for name, (first, last) in elsewhere.items()
         },
         "success_before": before[0].success.astype(int).tolist(),
@@ -161,11 +161,16 @@ def train_in(
     }
 
 
-def _training(workplace: Workplace, model: str, policy: ImagePolicy, imagined: Environment) -> Iterator[float]:
-    """Train in place; the success rate of each update's rollout."""
+def train_on(
+    workplace: Workplace, policy: ImagePolicy, imagined: Environment | None, scenes: str = ""
+) -> Iterator[float]:
+    """Train in place; the success rate of each update's rollout.
+
+    imagined: None: the simulator, where success alone pays. scenes: of the simulator, others than the configuration's.
+    """
     config = workplace.config
-    if model == SIMULATOR:
-        with workplace.simulator() as env:
+    if imagined is None:
+        with workplace.simulator(scenes) as env:
             yield from _success_rates(policy, env, RuleReward(), config)
     else:
         yield from _success_rates(policy, imagined, make_endogenous_reward(config, workplace.model_dir), config)
@@ -179,10 +184,10 @@ def _success_rates(policy: ImagePolicy, env: Environment, reward: RewardModel, c
 def measure_policy(workplace: Workplace, weights: Path, models: Sequence[str]) -> dict[str, Any]:
     """Success of a policy in the simulator and in each model, its row of the ranking."""
     policy = workplace.policy(weights)
-    imagined = {model: _rate(workplace.imagined(policy, workplace.environment(model))) for model in models}
+    imagined = {model: rate_of(workplace.imagined(policy, workplace.environment(model))) for model in models}
     return {
         "policy": str(weights), "sha256": file_sha256(weights), "config": workplace.config.model_dump(mode="json"),
-        "real": _rate(workplace.real(policy)),
+        "real": rate_of(workplace.real(policy)),
         "imagined": imagined,
     }
 
@@ -229,7 +234,7 @@ def _gain(before: EvaluationResult, after: EvaluationResult) -> dict[str, float]
     return {"difference": pair.difference, "low": pair.low, "high": pair.high}
 
 
-def _rate(result: EvaluationResult) -> dict[str, float]:
+def rate_of(result: EvaluationResult) -> dict[str, float]:
     low, high = wilson_interval(result.successes, result.episodes)
     return {"rate": result.success_rate, "successes": result.successes, "episodes": result.episodes, "low": low,
             "high": high}

@@ -30,6 +30,8 @@ EXPECTED = (RunError, ValueError, OSError, ImportError, FloatingPointError)
 """Errors whose text says what to do; anything else is a fault of this program and shows its traceback."""
 TOP = ("--seed", "--task", "--device")
 """Settings that are options of a verb, or cannot be given."""
+EXPERIMENTS = ("benchmark", "reproduce")
+"""First words of verbs that are experiments."""
 BENCHMARKS = "benchmarks"
 """Package beside this one in the repository, not installed with it."""
 NO_BENCHMARKS = "the benchmarks come with the repository and are not installed; start launch_scripts/wm.py there"
@@ -67,6 +69,8 @@ GROUPS = {
         "benchmark trained-in": "policies trained in each model, measured in the simulator",
         "benchmark ranking": "imagined success of policies against their real success",
         "benchmark policy": "success of a policy in an environment of your own, and what that measures beside it",
+        "reproduce roboscape": "Table 1 of RoboScape-R at this size, in and out of domain, with every control",
+        "reproduce roboscape-rewards": "Figure 3 of RoboScape-R with numbers: which reward tells what really succeeds",
         "benchmark disc-base": "the video model that experiments on the moving disc begin with",
         "benchmark diversity": "diversity on the moving disc, at equal quality and noise budget",
         "benchmark learning": "reward against model calls, every sampler on one learner",
@@ -87,7 +91,7 @@ GROUPS = {
 }
 VERBS = {name: about for verbs in GROUPS.values() for name, about in verbs.items()}
 """What each verb does, by its name; `train-policy` is the module wm_nodes.apps.train_policy, `judge check` is
-wm_nodes.apps.judge.check, `benchmark NAME` an experiment of benchmarks.experiment."""
+wm_nodes.apps.judge.check, `benchmark NAME` and `reproduce NAME` experiments of benchmarks.experiment."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -171,14 +175,14 @@ def parser_of(name: str, program: str) -> Parser:
     group, _, experiment = name.partition(" ")
     with leaving_when_interrupted():
         verb: Any = (
-            import_module(f"{BENCHMARKS}.experiment").find_experiment(experiment) if group == "benchmark"
+            import_module(f"{BENCHMARKS}.experiment").find_experiment(experiment) if group in EXPERIMENTS
             else import_module(module_of(name))
         )
     parser = Parser(
         prog=program, description=inspect.cleandoc(verb.__doc__), epilog=EXIT_CODES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.set_defaults(run=verb.start if group == "benchmark" else getattr(verb, "run", None))
+    parser.set_defaults(run=verb.start if group in EXPERIMENTS else getattr(verb, "run", None))
     verb.add_options(parser)
     return parser
 

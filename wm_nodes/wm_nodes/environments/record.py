@@ -72,12 +72,13 @@ def task_plan(config: RunConfig, num_episodes: int, first_seed: int) -> Collecti
 
 
 def demonstration_plan(config: RunConfig, num_episodes: int, first_seed: int | None = None) -> CollectionPlan:
-    """Return the plan of MPLib demonstrations of the configured task, for behaviour cloning. first_seed: None: of the
-    configuration's root seed."""
+    """Return the plan of MPLib demonstrations of the configured task in sft.scenes, for behaviour cloning. first_seed:
+    None: of the configuration's root seed."""
     if first_seed is None:
         first_seed = demonstration_seeds(config.seed, num_episodes)
+    simulation = config.simulation.with_values(scenes=config.sft.scenes or config.simulation.scenes)
     return CollectionPlan(
-        task=config.task, simulation=config.simulation, num_episodes=num_episodes, first_seed=first_seed,
+        task=config.task, simulation=simulation, num_episodes=num_episodes, first_seed=first_seed,
         behaviours={"expert": 1.0}, end_on_success=True,
     )
 

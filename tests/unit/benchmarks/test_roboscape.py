@@ -1,0 +1,77 @@
+"""Table 1 of RoboScape-R: its formula on the paper's own cells, its cells, and every kind of training end to end."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from model_folders import make_model_folder
+
+from benchmarks.environments.roboscape import (
+    ALL_SCENES,
+    MODEL,
+    ONE_SCENE,
+    OOD,
+    PAPER,
+    SFT,
+    TASKS,
+    cell,
+    gain,
+    scene_of_seed,
+)
+from wm_nodes.apps.cli import main
+from wm_nodes.config.load import load_config
+from wm_nodes.config.scenes import splits
+
+
+def row(task: str, training: str, seed: int, ind: float, ood: float, **more: object) -> dict[str, Any]:
+    rates = {"own": ind, OOD[0]: ood - 10, OOD[1]: ood + 10}
+    success = {name: {"rate": rate / 100} for name, rate in rates.items()}
+    return {"task": task, "model": training, "seed": seed, "scene": "own", "success": success, **more}
+
+
+def test_the_papers_cells_give_the_papers_gain() -> None:
+    rows = [row(task, name, 0, PAPER[name, "IND"][i], PAPER[name, "OOD"][i])
+            for i, task in enumerate(TASKS) for name in (SFT, ONE_SCENE, MODEL)]
+    assert gain(rows, ONE_SCENE) == "+44.7" and gain(rows, ALL_SCENES) == ""
+
+
+def test_the_interval_of_a_gain_is_over_seeds_that_both_have() -> None:
+    rows = [row("push", MODEL, seed, 90, 80 + seed) for seed in range(3)]
+    rows += [row("push", ONE_SCENE, seed, 90, 60) for seed in range(2)]
+    assert gain(rows, ONE_SCENE).startswith("+20.5 (+14.1 to +26.9 over 2 seeds")
+
+
+def test_a_cell_says_its_mean_its_interval_and_whether_the_model_is_accepted() -> None:
+    two = [row("push", MODEL, seed, 50 + 10 * seed, 20, accepted=True) for seed in range(2)]
+    assert cell(two[:1], "IND") == "50.0" and cell(two[:1], "OOD") == "20.0" and cell([], "IND") == ""
+    assert cell(two, "IND").startswith("55.0 (-8.5 to 118.5")
+    assert cell([row("push", MODEL, 0, 50, 20, accepted=False)], "OOD") == "[20.0]"
+
+
+def test_the_demonstrations_of_a_seed_are_of_one_training_scene() -> None:
+    scenes = [scene_of_seed(seed) for seed in range(8)]
+    assert len(set(scenes)) > 4 and set(scenes) <= set(splits()["train"])
+
+
+@pytest.mark.slow
+@pytest.mark.rendering
+def test_every_training_is_made_once_and_measured_in_and_out_of_domain(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = {"simulation.max_episode_steps": 20, "evaluation.episodes": 1, "acceptance.num_episodes": 2,
+             "acceptance.clone_episodes": 2, "data.num_workers": 1, "sft.num_demonstrations": 1, "ppo.updates": 1,
+             "tokenizer.foreground": "background"}
+    model = make_model_folder(tmp_path / "model", load_config("smoke", {"task": "push", **short}))
+    file = tmp_path / "rows.json"
+    words = ["reproduce", "roboscape", "--preset", "smoke", "--model-dir", str(model), "--tasks", "push",
+             "--seeds", "0", "--json", str(file), "--work", str(tmp_path / "work"), "--policy.inputs", "latents",
+             *(word for name, value in short.items() for word in (f"--{name}", str(value)))]
+    assert main(words) == 0
+    rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
+    assert [one["model"] for one in rows] == [SFT, ONE_SCENE, ALL_SCENES, MODEL]
+    assert all(one["success"].keys() == {scene_of_seed(0), *OOD} for one in rows)
+    assert [len(one["course"]) for one in rows] == [0, 1, 1, 1] and rows[-1]["accepted"] is False
+    shown = capsys.readouterr().out
+    assert "[0.0]" in shown and "RL in the simulator, all training scenes" in shown
+    assert main(words) == 0 and json.loads(file.read_text(encoding="utf-8"))["rows"] == rows

@@ -1,0 +1,264 @@
+"""Figure 3 of RoboScape-R with numbers: which reward tells, in the world model, what succeeds in the simulator?
+
+The actions of simulator episodes are imagined from their first frames; every reward scores the imagined steps, and the
+simulator says which episodes succeed. Shapes: E episodes, T steps, F features.
+"""
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from benchmarks.environments.experiments import Configured, is_finished
+from benchmarks.environments.policies import spearman
+from benchmarks.experiment import Count, console
+from wm_nodes.config.load import load_config
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.seed_ranges import HELDOUT, NEW_CONTEXTS
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.seeding import numpy_stream, torch_stream
+from wm_nodes.core.statistics import auroc
+from wm_nodes.core.types import FloatArray, UInt8Array
+from wm_nodes.environments.record import collect_plan, task_plan
+from wm_nodes.policy_rl.factories import make_encoder, models_of
+from wm_nodes.recording import read_episodes
+from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
+from wm_nodes.reports.console_table import make_table
+from wm_nodes.reward import EncoderDistance, EndogenousReward, RewardInput
+from wm_nodes.world_model.folder import WorldModels
+from wm_nodes.world_model.text import ImaginedGoals, imagine_goals
+from wm_nodes.world_model.validation.open_loop import BATCH, ImaginedEpisodes, imagine
+
+DOMAINS = ("train", "ood_object", "ood_combo")
+EMPTY_HAND = "no_grasp"
+"""The behaviour that moves like a demonstration and never closes the gripper."""
+BEHAVIOURS = {"expert": 0.4, EMPTY_HAND: 0.2, "noisy": 0.15, "near_miss": 0.15, "short": 0.1}
+TOGETHER = 16
+"""Episodes whose frames and golden trajectories the distance keeps in memory."""
+DRAWS = 1000
+RIDGE = 1.0
+PROXY_WIDTH, PROXY_ITERATIONS, PROXY_BATCH = 256, 2000, 256
+
+
+@dataclass(frozen=True)
+class Imagined:
+    """Episodes of one domain, as simulated and as imagined."""
+
+    real: EpisodeArrays
+    """As recorded."""
+    frames: UInt8Array
+    """uint8 (E, T + 1, H, W, 3), from the real first frame."""
+    signals: FloatArray
+    """float32 (E, T), the done signal of the task."""
+    uncertainty: FloatArray
+    """float32 (E, T)."""
+    features: FloatArray
+    """float32 (E, T, F), of the world model's last layer, pooled, as its done heads see them."""
+
+    @property
+    def won(self) -> NDArray[np.bool_]:
+        """(E,), success at any step in the simulator."""
+        won: NDArray[np.bool_] = (self.real.success[..., 0] & self.real.frame_mask).any(1)
+        return won
+
+
+@dataclass(kw_only=True)
+class RewardTest(Configured):
+    """Figure 3 of RoboScape-R with numbers: how well each reward, on imagined steps, tells episodes that succeed in the
+    simulator from those that do not, from an empty hand's alone, and how it grows along a success; with training
+    scenes, unseen objects and unseen combinations."""
+
+    task: str = "pick_place"
+    """Of the episodes; --task."""
+    episodes: Count = 100
+    """Simulator episodes of each domain."""
+    learned_from: Count = 200
+    """Simulator episodes in training scenes that the learned rewards have seen."""
+    work: Path = Path("runs/reward_test")
+    """Folder of the episodes; what is there is kept."""
+
+    def run(self) -> None:
+        config = load_config(self.preset, {"task": self.task, **self.settings})
+        model_dir, rows = self.model_dir or shipped_model(self.task), self.read()
+        models = models_of(model_dir, config.device)
+        wanted = {"config": config.model_dump(mode="json"), "world_model_sha256": models.sha256,
+                  "episodes": self.episodes, "learned_from": self.learned_from}
+        if not is_finished(rows, wanted):
+            seen = self._imagined(config, models, "train", NEW_CONTEXTS.take(self.learned_from), self.learned_from)
+            heads = learned_heads(seen, model_dir, config.seed)
+            for domain in DOMAINS:
+                found = self._imagined(config, models, domain, HELDOUT.take(self.episodes), self.episodes)
+                goals = goals_of(models, found.real, config)
+                scored = paid(found, goals, model_dir, config) | {name: head(found) for name, head in heads.items()}
+                for name, values in scored.items():
+                    told = judge_reward(values, found, config.seed)
+                    rows.append({**wanted, "task": self.task, "domain": domain, "reward": name, **told})
+            self.write({"rows": rows}, device=config.device)
+        columns = ("reward", "scenes", "episodes", "succeed", "AUROC (95 %)", "AUROC, empty hand", "rank correlation")
+        console.print(make_table(f"{self.task}: what a reward tells of real success", columns, [
+            (row["reward"], row["domain"], str(row["episodes_scored"]), str(row["successes"]),
+             "{:.2f} ({:.2f} to {:.2f})".format(*row["auroc"]), f"{row['auroc_empty_hand']:.2f}",
+             f"{row['rank_correlation']:+.2f}")
+            for row in rows if is_finished([row], wanted)
+        ]))
+
+    def _imagined(self, config: RunConfig, models: WorldModels, domain: str, first: int, count: int) -> Imagined:
+        chosen = config.with_values(
+            simulation=config.simulation.with_values(scenes=domain),
+            data=config.data.with_values(behaviours=BEHAVIOURS),
+        )
+        folder = self.work.absolute() / f"{self.task}_{domain}_{first}"
+        bags = collect_plan(task_plan(chosen, count, first), chosen, folder)
+        episodes = (episode for bag in bags for episode in read_episodes(bag))
+        return imagine_all(models, stack_episodes(episodes, [self.task]), self.task)
+
+
+def imagine_all(models: WorldModels, real: EpisodeArrays, task: str) -> Imagined:
+    """Imagine the recorded actions, and keep what the done heads see."""
+    column, seen, parts = models.task_index(task), list[Tensor](), list[ImaginedEpisodes]()
+
+    def keep(module: nn.Module, inputs: tuple[Tensor, Tensor], _: object) -> None:
+        tokens, register = inputs
+        seen.append(torch.cat((tokens.mean(2), tokens.amax(2), register), -1).float()[:, 0])
+
+    features = list[FloatArray]()
+    hook = models.action.done.register_forward_hook(keep)
+    try:
+        for i in range(0, len(real), BATCH):
+            rows = slice(i, i + BATCH)
+            seen.clear()
+            parts.append(imagine(models.tokenizer, models.action, real.images[rows, 0], real.actions[rows],
+                                 real.states[rows]))
+            features.append(torch.stack(seen, 1).cpu().numpy())
+    finally:
+        hook.remove()
+    frames, signals, spreads = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("frames", "signals", "uncertainty")
+    )
+    frames = np.concatenate([real.images[:, :1], frames], 1)
+    return Imagined(real, frames, signals[..., column], spreads[..., column], np.concatenate(features))
+
+
+def goals_of(models: WorldModels, real: EpisodeArrays, config: RunConfig) -> ImaginedGoals | None:
+    """The golden trajectory of every episode, of its first frame and instruction; None without a text model."""
+    if models.text is None:
+        return None
+    tasks = [models.task_index(config.task)] * len(real)
+    return imagine_goals(
+        models.text, models.tokenizer, real.images[:, 0], real.instructions, tasks, horizon=real.num_steps,
+        threshold=config.reward.goal_threshold,
+    )
+
+
+def paid(
+    found: Imagined, goals: ImaginedGoals | None, model_dir: Path, config: RunConfig
+) -> dict[str, NDArray[np.float64]]:
+    """By reward, its sum (E, T) up to each step, as RL is paid: nothing after the done signal."""
+    distance = EncoderDistance(make_encoder(model_dir, config.device), identity="reward_test")
+    asked: dict[str, dict[str, Any]] = {"done signal": {"dense_weight": 0.0, "sparse_weight": 1.0}}
+    if goals is not None:
+        asked |= {
+            "goal distance": {"dense_weight": 1.0, "sparse_weight": 0.0, "mode": "delta"},
+            "golden progress": {"dense_weight": 1.0, "sparse_weight": 0.0, "mode": "progress"},
+            "goal distance and done signal": {"dense_weight": 1.0, "sparse_weight": 1.0, "mode": "delta"},
+        }
+    crossed = found.signals > config.reward.success_threshold
+    valid = found.real.step_mask & (np.cumsum(crossed, 1) - crossed == 0)
+    sums = dict[str, NDArray[np.float64]]()
+    for name, settings in asked.items():
+        reward = EndogenousReward(config.reward.with_values(**settings), distance)
+        totals = np.zeros(valid.shape)
+        for i, t in itertools.product(range(0, len(valid), TOGETHER), range(valid.shape[1])):
+            rows = slice(i, i + TOGETHER)
+            known: dict[str, Any] = {} if goals is None else {
+                "goals": goals.goals[rows], "golden": goals.frames[rows], "golden_lengths": goals.lengths[rows],
+            }
+            step = RewardInput(
+                found.frames[rows, t], found.frames[rows, t + 1], found.signals[rows, t], valid[rows, t],
+                found.uncertainty[rows, t], **known,
+            )
+            totals[rows, t] = np.nan_to_num(reward.evaluate(step).total)
+        sums[name] = np.cumsum(totals, 1)
+    return sums
+
+
+def learned_heads(seen: Imagined, model_dir: Path, seed: int) -> dict[str, Callable[[Imagined], NDArray[np.float64]]]:
+    """Rewards learned from success in training scenes; each gives, up to every step, the largest value so far (E, T).
+
+    embedding head: linear, on the world model's features, least squares (iVideoGPT). proxy network: an MLP on the
+    tokenizer's latents of a frame (DiWA).
+    """
+    mask, success = seen.real.step_mask, seen.real.success[:, 1:, 0]
+    inputs = np.concatenate([seen.features, np.ones_like(seen.features[..., :1])], -1)[mask].astype(np.float64)
+    targets = success[mask].astype(np.float64)
+    weights = np.linalg.solve(inputs.T @ inputs + RIDGE * np.eye(inputs.shape[1]), inputs.T @ targets)
+
+    def embedding(found: Imagined) -> NDArray[np.float64]:
+        return largest(found.features.astype(np.float64) @ weights[:-1] + weights[-1], found)
+
+    encode = make_encoder(model_dir)
+    network = _train_proxy(_encoded(encode, seen.real.images[:, 1:])[mask], targets, seed)
+
+    def proxy(found: Imagined) -> NDArray[np.float64]:
+        with torch.no_grad():
+            values = network(torch.from_numpy(_encoded(encode, found.frames[:, 1:])))[..., 0].sigmoid()
+        return largest(values.numpy().astype(np.float64), found)
+
+    return {"embedding head": embedding, "proxy network": proxy}
+
+
+def largest(values: NDArray[np.float64], found: Imagined) -> NDArray[np.float64]:
+    """Of values (E, T), the largest so far; what follows the end of an episode does not count."""
+    result: NDArray[np.float64] = np.maximum.accumulate(np.where(found.real.step_mask, values, -np.inf), 1)
+    return result
+
+
+def judge_reward(values: NDArray[np.float64], found: Imagined, seed: int) -> dict[str, Any]:
+    """What a reward, given by its sum up to each step (E, T), says of real success: see RewardTest."""
+    won, scores = found.won, values[:, -1]
+    empty = np.array([behaviour == EMPTY_HAND for behaviour in found.real.behaviours]) & ~won
+    draws = numpy_stream(seed, "reward_test", len(won)).integers(len(won), size=(DRAWS, len(won)))
+    drawn = np.array([auroc(won[rows], scores[rows]) for rows in draws])
+    rows = np.flatnonzero(won)
+    first = found.real.success[rows, 1:, 0].argmax(1) + 1
+    along = [spearman(np.arange(steps), values[row, :steps], seed=seed, draws=1)[0]
+             for row, steps in zip(rows, first, strict=True) if steps > 2]
+    return {
+        "episodes_scored": len(won), "successes": int(won.sum()),
+        "auroc": [auroc(won, scores), *np.nanquantile(drawn, (0.025, 0.975)).tolist()],
+        "auroc_empty_hand": auroc(won[won | empty], scores[won | empty]),
+        "rank_correlation": float(np.nanmean(along)) if along else float("nan"),
+    }
+
+
+def _encoded(encode: Callable[[Tensor], Tensor], images: UInt8Array) -> FloatArray:
+    """Features (E, T, F) of frames (E, T, H, W, 3)."""
+    flat = images.reshape(-1, *images.shape[2:])
+    with torch.inference_mode():
+        parts = [encode(torch.from_numpy(flat[i : i + 256])).float().numpy() for i in range(0, len(flat), 256)]
+    features: FloatArray = np.concatenate(parts).reshape(*images.shape[:2], -1)
+    return features
+
+
+def _train_proxy(features: FloatArray, targets: NDArray[np.float64], seed: int) -> nn.Module:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = nn.Sequential(
+            nn.Linear(features.shape[-1], PROXY_WIDTH), nn.SiLU(), nn.Linear(PROXY_WIDTH, PROXY_WIDTH), nn.SiLU(),
+            nn.Linear(PROXY_WIDTH, 1),
+        )
+    inputs, wanted = torch.from_numpy(features), torch.from_numpy(targets).float()
+    optimizer, stream = torch.optim.AdamW(network.parameters(), lr=1e-3), torch_stream(seed, "proxy")
+    for _ in range(PROXY_ITERATIONS):
+        rows = torch.randint(len(inputs), (PROXY_BATCH,), generator=stream)
+        loss = nn.functional.binary_cross_entropy_with_logits(network(inputs[rows])[:, 0], wanted[rows])
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+    return network.eval()
