@@ -1,4 +1,4 @@
-"""OpenVLA (Prismatic, fused DINOv2 and SigLIP on Llama 2) from a local folder in the layout of its public checkpoint.
+"""OpenVLA (Prismatic, fused DINOv2 and SigLIP on Llama 2) from a folder in the layout of its checkpoint (RS-10f).
 
 Shapes: B batch, H W 3 image, P patches, L words of the prompt, D width of the language model, A action, V = 256 action
 tokens.

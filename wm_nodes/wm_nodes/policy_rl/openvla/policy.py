@@ -1,4 +1,4 @@
-"""OpenVLA behind the interface of ImagePolicy: what trains and evaluates that trains and evaluates this.
+"""OpenVLA behind the interface of ImagePolicy (RS-10f): what trains and evaluates that trains and evaluates this.
 
 The likelihood of an action is that of its tokens, renormalised over the 256 action tokens; LoRA and value head as in
 RL4VLA. Shapes: B batch, F = H W 3 features of an image: its pixels, A action, V action tokens.
