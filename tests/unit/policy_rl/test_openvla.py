@@ -145,6 +145,18 @@ def test_ppo_and_grpo_train_it_in_the_world_model(folder: Path, tmp_path: Path, 
     assert all(torch.equal(base[name], t) for name, t in policy.named_parameters() if name in base)
 
 
+def test_the_fastest_training_environment_is_one_that_shows_it_pictures(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Device rollouts hand on features of the world model's tokenizer, which it does not see by."""
+    monkeypatch.setattr(factories, "compute_device", lambda name: torch.device("meta"))
+    monkeypatch.setattr(factories, "make_imagined_environment", lambda *_, **__: "pictures")
+    monkeypatch.setattr(factories, "make_device_environment", lambda *_, **__: "features")
+    for checkpoint, shown in ((str(folder), "pictures"), ("", "features")):
+        config = load_config("smoke", {"policy.checkpoint": checkpoint})
+        assert factories.make_training_environment(config, tmp_path, num_envs=1, seed=0) == shown
+
+
 def test_what_a_folder_lacks_is_named(tmp_path: Path, folder: Path) -> None:
     config = load_config("smoke", {"policy.checkpoint": str(tmp_path)})
     with pytest.raises(OpenVlaError, match=r"lacks config.json, tokenizer.json, \*.safetensors"):

@@ -233,6 +233,11 @@ class PolicyConfig(SettingsSection):
     checkpoint: str = ""
     """Folder of an OpenVLA checkpoint, as published, to be the policy instead (policy_rl/openvla); empty: none."""
 
+    @property
+    def foreign(self) -> bool:
+        """Whether it sees by something else than the world model's tokenizer."""
+        return bool(self.factory or self.checkpoint)
+
 
 class LearnerConfig(SettingsSection):
     factory: FactoryName = ""

@@ -57,7 +57,7 @@ def make_reward(kind: str, config: RunConfig, model_dir: str) -> RewardModel:
 
 def make_policy(config: RunConfig, model_dir: str) -> ImagePolicy:
     """Build a policy with fresh weights."""
-    folder = None if config.policy.factory else existing(model_dir, "model_dir")
+    folder = None if config.policy.foreign else existing(model_dir, "model_dir")
     from wm_nodes.policy_rl import factories
 
     return factories.make_policy(config, folder)

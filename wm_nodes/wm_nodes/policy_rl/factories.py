@@ -276,12 +276,12 @@ def make_training_environment(
     config: RunConfig, model_dir: Path | None, *, num_envs: int, seed: int
 ) -> Environment | DeviceEnvironment:
     """Return the environment that policy_rl.train trains in fastest: on a GPU rollouts stay there, unless
-    imagined_environment or a factory is set. Without a model it is the real one."""
+    imagined_environment, a factory or policy.checkpoint is set. Without a model it is the real one."""
     settings = config.imagined_environment
     if model_dir is None:
         return make_environment(config, config.environment.factory, num_envs=num_envs, seed=seed)
     starts_file = model_dir / STARTS
-    factory = config.policy.factory or config.reward.factory or config.learner.factory
+    factory = config.policy.foreign or config.reward.factory or config.learner.factory
     if compute_device(config.device).type == CPU or settings.picture_noise or settings.second_model or factory:
         return make_imagined_environment(config, model_dir, starts_file, num_envs=num_envs, seed=seed, training=True)
     return make_device_environment(config, model_dir, starts_file, num_envs=num_envs)
