@@ -4,18 +4,18 @@ from statistics import mean
 
 from benchmarks.tables.table import Rows, percent, points, read
 
-FILE, PLANNED = "policy_rl_from_clips.json", "planned demonstrations"
+FILE, PLANNED = "policy_rl_from_clips.json", ("planned demonstrations", 4)
 
 
 def clones() -> Rows:
     rows = read(FILE)["rows"]
-    usual = {one["seed"]: one["success_after"] for one in rows if one["start"] == PLANNED and "success_after" in one}
+    usual = {one["seed"]: one["success_after"] for one in rows if (one["start"], one["demonstrations"]) == PLANNED}
     for start, episodes in dict.fromkeys((one["start"], one["demonstrations"]) for one in rows):
         of = [one for one in rows if (one["start"], one["demonstrations"]) == (start, episodes)]
         trained = [one for one in of if "success_after" in one]
         clone = [mean(one["success_before"]) for one in of]
         after = [mean(one["success_after"]) for one in trained]
-        pairs = [(usual[one["seed"]], one["success_after"]) for one in trained if start != PLANNED]
+        pairs = [(usual[one["seed"]], one["success_after"]) for one in trained if (start, episodes) != PLANNED]
         first, last = ([x for pair in pairs for x in pair[i]] for i in (0, 1))
         yield (
             start, episodes, ", ".join(str(one["seed"]) for one in of), ", ".join(map(percent, clone)),

@@ -9,6 +9,9 @@ from benchmarks.video_rl.comparison import gains, paired_interval
 from wm_nodes.core.statistics import bootstrap_mean
 
 LEARNING, ABLATIONS, CLIP_LEARNING = (f"video_rl_{name}.json" for name in ("learning", "ablations", "clip_learning"))
+AS_WRITTEN = "video_rl_as_written.json"
+FIRST, LAST = slice(0, 3), slice(-3, None)
+"""Buffers of a training."""
 SCORES = (("reward", 3), ("obeyed", 3), ("mass", 2), ("background", 4))
 CLIP_SCORES = (("tracking", 3), ("object_cm", 2), ("tool_cm", 2), ("psnr_db", 3))
 
@@ -122,3 +125,36 @@ def hacking() -> Rows:
         ends = [one["evaluations"][-1] for one in trained]
         after = (", ".join(f"{end[key]:.2f}" for end in ends) for key in ("consistency", "obeyed", "mass"))
         yield name, *after, f"{alarms} of {len(trained)}"
+
+
+def as_written() -> Rows:
+    found = read(AS_WRITTEN)
+    rates = {one["name"]: one["grpo"]["learning_rate"] for one in found["samplers"]}
+    trainings = samplers(found["rows"])
+    for name, trained in trainings.items():
+        courses = (
+            " → ".join(f"{mean(of_buffers(one, measure, part) for one in trained):.3f}" for part in (FIRST, LAST))
+            for measure in ("reward_mean", "rollout_diversity")
+        )
+        yield (
+            name, len(trained), f"{rates[name]:g}", *courses,
+            ", ".join(f"{one['evaluations'][-1]['success']:.2f}" for one in trained),
+            *gained(trained, [("success", 3), ("outcome", 3)]),
+        )
+    first, *others = trainings
+    for other in others:
+        pairs = list(zip(trainings[first], trainings[other], strict=True))  # one seed each
+        apart = [
+            paired_interval([of_buffers(one, measure, LAST) - of_buffers(base, measure, LAST) for one, base in pairs])
+            for measure in ("reward_mean", "rollout_diversity")
+        ] + [
+            paired_interval([one["evaluations"][-1][name] - base["evaluations"][-1][name] for one, base in pairs])
+            for name in ("success", "outcome")
+        ]
+        cells = [interval(one.mean, one.low, one.high, 3) for one in apart]
+        yield f"{first} - {other}", len(pairs), "", *cells[:2], "", *cells[2:]
+
+
+def of_buffers(row: Run, measure: str, part: slice) -> float:
+    values: list[float] = row["buffers"][measure]
+    return mean(values[part])
