@@ -44,7 +44,8 @@ OPTIONS = {
     "judge hack": "clips --config --device --judge --judge-model --judge-key-env --rubric --least --limit "
     "--limit-clips --seed --reads --json --pictures",
     "audit": "verify recover sample view agree people replay",
-    **{f"benchmark {name}": "--json" for name in EXPERIMENTS}, "benchmark tables": "--check --docs",
+    **{f"{'reproduce' if name.startswith('roboscape') else 'benchmark'} {name}": "--json" for name in EXPERIMENTS},
+    "benchmark tables": "--check --docs",
 }
 
 
