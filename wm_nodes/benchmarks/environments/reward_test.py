@@ -19,6 +19,7 @@ from benchmarks.environments.experiments import Configured, is_finished
 from benchmarks.environments.policies import spearman
 from benchmarks.experiment import Count, console
 from wm_nodes.config.load import load_config
+from wm_nodes.config.scenes import splits
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT, NEW_CONTEXTS
 from wm_nodes.config.shipped import shipped_model
@@ -35,7 +36,6 @@ from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.text import ImaginedGoals, imagine_goals
 from wm_nodes.world_model.validation.open_loop import BATCH, ImaginedEpisodes, imagine
 
-DOMAINS = ("train", "ood_object", "ood_combo")
 EMPTY_HAND = "no_grasp"
 """The behaviour that moves like a demonstration and never closes the gripper."""
 BEHAVIOURS = {"expert": 0.4, EMPTY_HAND: 0.2, "noisy": 0.15, "near_miss": 0.15, "short": 0.1}
@@ -92,7 +92,7 @@ class RewardTest(Configured):
         if not is_finished(rows, wanted):
             seen = self._imagined(config, models, "train", NEW_CONTEXTS.take(self.learned_from), self.learned_from)
             heads = learned_heads(seen, model_dir, config.seed)
-            for domain in DOMAINS:
+            for domain in splits():
                 found = self._imagined(config, models, domain, HELDOUT.take(self.episodes), self.episodes)
                 goals = goals_of(models, found.real, config)
                 scored = paid(found, goals, model_dir, config) | {name: head(found) for name, head in heads.items()}

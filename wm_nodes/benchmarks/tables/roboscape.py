@@ -1,7 +1,7 @@
 """Rows of the tables of docs/results/roboscape.md; what they are about stands in pages.yaml."""
 
-from benchmarks.environments.reward_test import DOMAINS
 from benchmarks.tables.table import Rows, read
+from wm_nodes.config.scenes import splits
 
 REWARDS = "roboscape_rewards.json"
 
@@ -11,7 +11,7 @@ def rewards() -> Rows:
     for task, reward in dict.fromkeys((one["task"], one["reward"]) for one in found):
         of = {one["domain"]: one for one in found if (one["task"], one["reward"]) == (task, reward)}
         yield (
-            task, reward, *("{:.2f} [{:.2f}, {:.2f}]".format(*of[domain]["auroc"]) for domain in DOMAINS),
-            *("/".join(form.format(of[domain][name]) for domain in DOMAINS)
+            task, reward, *("{:.2f} [{:.2f}, {:.2f}]".format(*of[domain]["auroc"]) for domain in splits()),
+            *("/".join(form.format(of[domain][name]) for domain in splits())
               for name, form in (("auroc_empty_hand", "{:.2f}"), ("rank_correlation", "{:+.2f}"))),
         )

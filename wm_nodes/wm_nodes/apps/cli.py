@@ -30,7 +30,7 @@ EXPECTED = (RunError, ValueError, OSError, ImportError, FloatingPointError)
 """Errors whose text says what to do; anything else is a fault of this program and shows its traceback."""
 TOP = ("--seed", "--task", "--device")
 """Settings that are options of a verb, or cannot be given."""
-EXPERIMENTS = ("benchmark", "reproduce")
+EXPERIMENT_WORDS = ("benchmark", "reproduce")
 """First words of verbs that are experiments."""
 BENCHMARKS = "benchmarks"
 """Package beside this one in the repository, not installed with it."""
@@ -175,14 +175,14 @@ def parser_of(name: str, program: str) -> Parser:
     group, _, experiment = name.partition(" ")
     with leaving_when_interrupted():
         verb: Any = (
-            import_module(f"{BENCHMARKS}.experiment").find_experiment(experiment) if group in EXPERIMENTS
+            import_module(f"{BENCHMARKS}.experiment").find_experiment(experiment) if group in EXPERIMENT_WORDS
             else import_module(module_of(name))
         )
     parser = Parser(
         prog=program, description=inspect.cleandoc(verb.__doc__), epilog=EXIT_CODES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.set_defaults(run=verb.start if group in EXPERIMENTS else getattr(verb, "run", None))
+    parser.set_defaults(run=verb.start if group in EXPERIMENT_WORDS else getattr(verb, "run", None))
     verb.add_options(parser)
     return parser
 
