@@ -45,7 +45,7 @@ def test_the_interval_of_a_gain_is_over_seeds_that_both_have() -> None:
 def test_a_cell_says_its_mean_its_interval_and_whether_the_model_is_accepted() -> None:
     two = [row("push", MODEL, seed, 50 + 10 * seed, 20, accepted=True) for seed in range(2)]
     assert cell(two[:1], "IND") == "50.0" and cell(two[:1], "OOD") == "20.0" and cell([], "IND") == ""
-    assert cell(two, "IND").startswith("55.0 (-8.5 to 118.5")
+    assert cell(two, "IND") == "55.0 (0.0 to 100.0)"
     assert cell([row("push", MODEL, 0, 50, 20, accepted=False)], "OOD") == "[20.0]"
 
 

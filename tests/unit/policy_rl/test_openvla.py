@@ -55,6 +55,11 @@ def test_actions_are_middles_of_bins_and_their_likelihood_is_that_of_their_token
     assert (alone.actions == drawn.actions[1:2]).all()
 
 
+def test_the_critic_reads_what_the_likelihood_has_read(policy: OpenVlaPolicy) -> None:
+    output, inputs = policy.act(pictures(), states()), (policy.features(pictures()), torch.zeros(B, 3))
+    np.testing.assert_allclose(output.values, policy.value(*inputs).detach().numpy(), atol=1e-5)
+
+
 def test_noise_draws_from_the_law(policy: OpenVlaPolicy) -> None:
     """Quantiles at equal steps hit every first token as often as it is likely."""
     count = 2000

@@ -164,12 +164,22 @@ def test_a_model_that_only_scripted_episodes_speak_for_is_refused_by_the_cloned_
     assert report.failed == ("done precision, cloned policy (80)",) and report.words.startswith("failed (done prec")
 
 
-def test_a_policy_better_than_the_done_signal_is_precise_is_warned_of() -> None:
-    def notes(real: int, found: CloneRollouts) -> str:
-        return " ".join(apply_criteria(GOOD, settings(), 16, (90, 100), (real, 100), found)[1])
-
-    assert "imagined successes 78% are real, and it succeeds in 91% already" in notes(91, clone(46, 13, 3))
-    assert "already" not in notes(70, clone(46, 13, 3)) + notes(70, clone(0, 0, 3))
+@pytest.mark.parametrize(
+    ("real", "found", "outcome"),
+    [
+        ((195, 200), clone(60, 4, 3), "failed"),  # 94 % against 97.5 %: less than what it has, by however little
+        ((91, 100), clone(46, 13, 3), "failed"),
+        ((70, 100), clone(46, 13, 3), "passed"),
+        ((70, 100), clone(3, 1, 3), "undecided"),
+        ((70, 100), clone(0, 0, 3), "undecided"),
+    ],
+)
+def test_a_policy_that_the_model_could_only_lower_is_not_trained_in_it(
+    real: tuple[int, int], found: CloneRollouts, outcome: str
+) -> None:
+    criteria, _ = apply_criteria(GOOD, settings(), 16, (90, 100), real, found)
+    room = next(row for row in criteria if row.name.startswith("room to learn"))
+    assert room.outcome == outcome and f"{real[0]}/{real[1]}" in room.name and "keep this policy" in room.remedy
 
 
 def test_intervals_of_the_held_out_numbers_stand_beside_them() -> None:

@@ -124,14 +124,15 @@ def success_of(row: dict[str, Any], domain: str) -> float:
 
 
 def cell(rows: Sequence[dict[str, Any]], domain: str) -> str:
-    """Mean over seeds, with its t interval where there are several, in brackets where the model is not accepted."""
+    """Mean over seeds, with its t interval (inside 0 to 100) where there are several; in brackets where the model is
+    not accepted."""
     if not rows:
         return ""
     rates = [success_of(row, domain) for row in rows]
     text = f"{fmean(rates):.1f}"
     if len(rates) > 1:
         over = paired_interval(rates)
-        text = f"{text} ({over.low:.1f} to {over.high:.1f})"
+        text = f"{text} ({max(0.0, over.low):.1f} to {min(100.0, over.high):.1f})"
     return text if all(row.get("accepted", True) for row in rows) else f"[{text}]"
 
 

@@ -84,6 +84,7 @@ GROUPS = {
         "benchmark as-written": "the same by the settings of the paper, DynDiff beside other samplers",
         "benchmark closed-loop": "a video model that goes on from its own frames, with controls",
         "benchmark public-size": "memory and time of public video models of their real sizes",
+        "benchmark openvla-size": "memory and arithmetic of OpenVLA-7B as a policy",
         "benchmark erring": "the reward agent under a judge that errs",
         "benchmark success-clips": "any judge on other people's labelled episodes",
         "benchmark tables": "the full tables of the result pages, from the result files",

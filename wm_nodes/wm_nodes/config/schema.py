@@ -377,5 +377,6 @@ class RunConfig(SettingsSection):
     def _check_scenes(self) -> Self:
         if self.task:
             instruction(self.task, self.simulation.scenes)
-            instruction(self.task, self.sft.scenes or self.simulation.scenes)
+            if self.sft.scenes:
+                instruction(self.task, self.sft.scenes, "sft.scenes")
         return self

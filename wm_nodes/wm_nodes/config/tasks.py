@@ -245,8 +245,9 @@ def success_or_recorded(task: str, ground_truth: Floats, recorded: NDArray[np.bo
     return success(task, ground_truth) if has_rule(task) and ground_truth.shape[-1] else recorded
 
 
-def instruction(task: str, scenes: str) -> str:
-    """The instruction of a batch of episodes: of the scene where `scenes` (simulation.scenes) is one, else the task's.
+def instruction(task: str, scenes: str, setting: str = "simulation.scenes") -> str:
+    """The instruction of a batch of episodes: of the scene where `scenes`, a value of the setting, is one, else the
+    task's.
 
     Raises:
         ValueError: the task has a scene of its own and `scenes` is not empty, or the other way round.
@@ -254,8 +255,8 @@ def instruction(task: str, scenes: str) -> str:
     chosen, known = get_task(task), scenes_of(scenes)
     instruct = chosen.simulator.instruct if chosen.simulator else None
     if bool(known) != (instruct is not None):
-        needs = "needs simulation.scenes, e.g. train" if instruct else "has a scene of its own; leave it empty"
-        raise ValueError(f"simulation.scenes is {scenes!r}, but task {task!r} {needs}")
+        needs = f"needs {setting}, e.g. train" if instruct else "has a scene of its own; leave it empty"
+        raise ValueError(f"{setting} is {scenes!r}, but task {task!r} {needs}")
     return instruct(known[0]) if instruct and len(known) == 1 else chosen.instruction
 
 

@@ -154,6 +154,11 @@ class ImagePolicy(nn.Module):
         """Return the critic's values, (B,)."""
         return cast(Tensor, self.critic(*self._normalise(features_BF, states_BS))).squeeze(-1)
 
+    def value_beside(self, distribution: DiagonalGaussian, features_BF: Tensor, states_BS: Tensor) -> Tensor:
+        """As value, for a policy whose distribution of the same inputs, once asked for a logprob, has read what its
+        critic reads, too."""
+        return self.value(features_BF, states_BS)
+
     @torch.no_grad()
     def act(
         self, images: UInt8Array, states: FloatArray, generator: torch.Generator | None = None, *,
@@ -183,7 +188,7 @@ class ImagePolicy(nn.Module):
         actions_BA = distribution.executed(noise_BA)
         return PolicyOutput(
             _to_numpy(actions_BA), _to_numpy(distribution.logprob(actions_BA)),
-            _to_numpy(self.value(features_BF, states_BS)),
+            _to_numpy(self.value_beside(distribution, features_BF, states_BS)),
         )
 
     def _normalise(self, features_BF: Tensor, states_BS: Tensor) -> tuple[Tensor, Tensor]:

@@ -207,7 +207,7 @@ class PpoLearner:
         entropies, kls = distribution.entropy(), distribution.kl(reference)
         loss = (policy_losses - config.entropy_weight * entropies + config.kl_reference_weight * kls).sum()
         if samples.groups is None:
-            values = self.policy.value(features, states)
+            values = self.policy.value_beside(distribution, features, states)
             value_losses = value_loss(values, samples.values[own], samples.returns[own], clip=config.value_clip)
             critic_loss = config.value_weight * value_losses.sum()
             loss = critic_loss if policy_frozen else critic_loss + loss

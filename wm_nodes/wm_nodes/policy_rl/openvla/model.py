@@ -5,10 +5,10 @@ tokens.
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 from safetensors.torch import load_file
@@ -42,6 +42,11 @@ class Prompt:
     """Keys and values, to go on from."""
 
 
+def vocabulary_of(config: Mapping[str, Any]) -> int:
+    """Tokens of the language model before the padding of its vocabulary."""
+    return int(config["text_config"]["vocab_size"]) - int(config.get("pad_to_multiple_of", 64))
+
+
 class _Projector(nn.Module):
     def __init__(self, vision: int, width: int) -> None:
         super().__init__()
@@ -60,20 +65,43 @@ class OpenVla(nn.Module):
         width: D.
 
     Args:
-        folder: config.json, tokenizer.json, *.safetensors.
-        instruction: of the robot, for every picture.
+        config: of config.json.
+        tensors: of the checkpoint, by name.
+        prompt: tokens (L,).
 
     Raises:
-        OpenVlaError: names what the folder lacks.
+        KeyError, RuntimeError, ValueError, TypeError: what config or tensors lack.
     """
 
     prompt_L: Tensor
 
-    def __init__(self, folder: Path, instruction: str, dtype: torch.dtype = torch.float32) -> None:
-        from tokenizers import Tokenizer
+    def __init__(self, config: Mapping[str, Any], tensors: Mapping[str, Tensor], prompt: Sequence[int]) -> None:
         from transformers import LlamaConfig, LlamaForCausalLM
 
         super().__init__()
+        towers = [{name.removeprefix(of): t for name, t in tensors.items() if name.startswith(of)} for of in TOWERS]
+        heads = config.get("vision_heads", NUM_HEADS)
+        eyes = [VisionTransformer(of, count) for of, count in zip(towers, heads, strict=True)]
+        text = LlamaConfig(**config["text_config"])
+        self.sides_px, self.width = [one.side_px for one in eyes], int(text.hidden_size)
+        self.towers = nn.ModuleList(eyes)
+        self.projector = _Projector(sum(one.width for one in eyes), self.width)
+        self.language_model: Any = LlamaForCausalLM(text)
+        for name in ("projector", "language_model"):
+            of = {key.removeprefix(f"{name}."): t for key, t in tensors.items() if key.startswith(f"{name}.")}
+            getattr(self, name).load_state_dict(of)
+        self.vocabulary = vocabulary_of(config)
+        self.register_buffer("prompt_L", torch.tensor(prompt), persistent=False)
+
+    @classmethod
+    def load(cls, folder: Path, instruction: str, dtype: torch.dtype = torch.float32) -> Self:
+        """Of a folder with config.json, tokenizer.json and *.safetensors. instruction: of the robot, for every picture.
+
+        Raises:
+            OpenVlaError: names what the folder lacks.
+        """
+        from tokenizers import Tokenizer
+
         lacking = [name for name in ("config.json", "tokenizer.json", "*.safetensors") if not any(folder.glob(name))]
         if lacking:
             raise OpenVlaError(f"{folder} lacks {', '.join(lacking)}; policy.checkpoint is a folder of an OpenVLA "
@@ -82,25 +110,12 @@ class OpenVla(nn.Module):
             config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
             tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))
             tensors = {name: t for file in sorted(folder.glob("*.safetensors")) for name, t in load_file(file).items()}
-            towers = [{name.removeprefix(of): t for name, t in tensors.items() if name.startswith(of)} for of in TOWERS]
-            heads = config.get("vision_heads", NUM_HEADS)
-            eyes = [VisionTransformer(of, count) for of, count in zip(towers, heads, strict=True)]
-            text = LlamaConfig(**config["text_config"])
-            self.sides_px, self.width = [one.side_px for one in eyes], int(text.hidden_size)
-            self.towers = nn.ModuleList(eyes)
-            self.projector = _Projector(sum(one.width for one in eyes), self.width)
-            self.language_model: Any = LlamaForCausalLM(text)
-            for name in ("projector", "language_model"):
-                of = {key.removeprefix(f"{name}."): t for key, t in tensors.items() if key.startswith(f"{name}.")}
-                getattr(self, name).load_state_dict(of)
+            ids = tokenizer.encode(PROMPT.format(instruction.lower())).ids
+            ids += [SPACE] if ids[-1] != SPACE and vocabulary_of(config) > SPACE else []
+            return cls(config, tensors, ids).to(dtype)
         except (OSError, KeyError, RuntimeError, ValueError, TypeError) as error:
             words = f"{folder} holds no whole OpenVLA checkpoint: {type(error).__name__} {error}; download it again"
             raise OpenVlaError(" ".join(words.split())) from None
-        self.to(dtype)
-        self.vocabulary = int(text.vocab_size - config.get("pad_to_multiple_of", 64))
-        ids = tokenizer.encode(PROMPT.format(instruction.lower())).ids
-        ids += [SPACE] if ids[-1] != SPACE and self.vocabulary > SPACE else []
-        self.register_buffer("prompt_L", torch.tensor(ids), persistent=False)
 
     def read(self, images_BHWC: Tensor) -> Prompt:
         """Read pictures, uint8 values (B, H, W, 3) of any float type, and the prompt."""
@@ -120,12 +135,13 @@ class OpenVla(nn.Module):
                 ).last_hidden_state[:, -1]
         return torch.stack(tokens, 1)
 
-    def action_logits(self, images_BHWC: Tensor, tokens_BA: Tensor) -> Tensor:
-        """Logits (B, A, V) of each action token after those before it, float32."""
+    def action_logits(self, images_BHWC: Tensor, tokens_BA: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits (B, A, V) of each action token after those before it, float32, and the hidden_BD of read()."""
         before = self.language_model.get_input_embeddings()(tokens_BA[:, :-1])
         inputs = torch.cat([self._inputs(images_BHWC), before], 1)
         hidden = self.language_model.model(inputs_embeds=inputs, use_cache=False).last_hidden_state
-        return self._action_logits(hidden[:, -tokens_BA.shape[1] :])
+        last = hidden[:, -tokens_BA.shape[1] :]
+        return self._action_logits(last), last[:, 0]
 
     @property
     def first_id(self) -> int:

@@ -34,7 +34,12 @@ VALUE_WIDTHS = (512, 128)
 class TokenDistribution:
     """The law of the actions of B pictures. entropy and kl are those of each token after the tokens of the actions that
     logprob was last asked about: unbiased where those were drawn from it, and what RL4VLA takes.
+
+    Attributes:
+        hidden_BD: what the network had read when it predicted the first of those tokens.
     """
+
+    hidden_BD: Tensor
 
     def __init__(self, network: OpenVla, tokenizer: ActionTokenizer, images_BHWC: Tensor, action_dim: int) -> None:
         self._network, self._tokenizer, self._images, self._action_dim = network, tokenizer, images_BHWC, action_dim
@@ -65,7 +70,8 @@ class TokenDistribution:
 
     def log_probabilities(self, tokens_BA: Tensor) -> Tensor:
         """(B, A, V), of each token after those before it."""
-        return self._network.action_logits(self._images, tokens_BA).log_softmax(-1)
+        logits, self.hidden_BD = self._network.action_logits(self._images, tokens_BA)
+        return logits.log_softmax(-1)
 
     def entropy(self) -> Tensor:
         """(B,), nats, see the class."""
@@ -91,17 +97,13 @@ class OpenVlaPolicy(ImagePolicy):
     Only LoRA and value head are trained, saved and sent; the checkpoint stays where it is.
 
     Args:
-        config: its checkpoint is the folder, see OpenVla; the rest is not used.
+        network: of a checkpoint.
+        config: kept, not used.
         spec: of the environment.
         seed: of LoRA and value head (stream openvla).
-
-    Raises:
-        OpenVlaError: the folder holds no checkpoint.
     """
 
-    def __init__(
-        self, config: PolicyConfig, spec: EnvironmentSpec, *, seed: int = 0, dtype: torch.dtype = torch.float32
-    ) -> None:
+    def __init__(self, network: OpenVla, config: PolicyConfig, spec: EnvironmentSpec, *, seed: int = 0) -> None:
         from peft import LoraConfig, inject_adapter_in_model
 
         nn.Module.__init__(self)
@@ -113,7 +115,7 @@ class OpenVlaPolicy(ImagePolicy):
 
         self.encoder = ImageEncoder(pixels, height * self.side * 3)
         self.state_dim, self.action_dim, self._height = spec.state_dim, spec.action_dim, height
-        network = OpenVla(Path(config.checkpoint), spec.instruction, dtype).requires_grad_(False)
+        network.requires_grad_(False)
         self._tokenizer = ActionTokenizer(network.vocabulary)
         with initial_weights(seed, "openvla"):
             self.actor = inject_adapter_in_model(LoraConfig(**LORA), network)
@@ -147,7 +149,16 @@ class OpenVlaPolicy(ImagePolicy):
 
     def value(self, features_BF: Tensor, states_BS: Tensor) -> Tensor:
         """The critic's values (B,), of what the network has read when it predicts the first action token."""
-        values: Tensor = self.critic(self._network.read(self._images(features_BF)).hidden_BD.float()).squeeze(-1)
+        return self._value_of(self._network.read(self._images(features_BF)).hidden_BD)
+
+    def value_beside(  # type: ignore[override]
+        self, distribution: TokenDistribution, features_BF: Tensor, states_BS: Tensor
+    ) -> Tensor:
+        """As value, of what the distribution has read for its logprob."""
+        return self._value_of(distribution.hidden_BD)
+
+    def _value_of(self, hidden_BD: Tensor) -> Tensor:
+        values: Tensor = self.critic(hidden_BD.float()).squeeze(-1)
         return values
 
     def cloning_error(self, features_BF: Tensor, states_BS: Tensor, actions_BA: Tensor) -> Tensor:
@@ -163,8 +174,8 @@ class OpenVlaPolicy(ImagePolicy):
 
 
 def make_policy(config: RunConfig) -> OpenVlaPolicy:
-    """The policy of policy.checkpoint, in bfloat16 on a GPU."""
-    device = compute_device(config.device)
+    """The policy of policy.checkpoint, in bfloat16 on a GPU. Raises OpenVlaError: the folder holds no checkpoint."""
+    device, spec = compute_device(config.device), configured_spec(config)
     dtype = torch.float32 if device.type == CPU else torch.bfloat16
-    policy = OpenVlaPolicy(config.policy, configured_spec(config), seed=config.seed, dtype=dtype)
-    return policy.to(device)
+    network = OpenVla.load(Path(config.policy.checkpoint), spec.instruction, dtype)
+    return OpenVlaPolicy(network, config.policy, spec, seed=config.seed).to(device)

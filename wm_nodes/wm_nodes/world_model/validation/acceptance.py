@@ -42,6 +42,10 @@ RECORDED_SUCCESSES = "record more episodes that succeed, or lower reward.success
 LOST_THINGS = "train the tokenizer longer (tokenizer.num_iterations), or with smaller patches (tokenizer.patch_px)"
 OTHER_ACTIONS = "record episodes in which the robot does different things from alike first frames, or train longer"
 POLICY_DATA = "refresh the model with more episodes of weak policies (data.policy_episodes)"
+GOOD_ALREADY = (
+    "keep this policy: it succeeds more often than what the model calls success is real; or refresh the model with its "
+    "episodes (data.policy_episodes)"
+)
 BETTER_GOALS = "train the text model longer (world_model.text_num_iterations), or set reward.dense_weight to 0"
 
 
@@ -238,9 +242,8 @@ def _policy_criteria(
             _of_clone("precision", clone.replayed[clone.imagined], limits.done_precision, config, MORE_NEAR_MISSES),
             _of_clone("recall", clone.imagined[clone.replayed], limits.done_recall, config, MORE_SUCCESSES),
         ]
-        if real is not None and (precision := criteria[0].value) < real[0] / real[1]:
-            notes.append(f"Of the cloned policy's imagined successes {precision:.0%} are real, and it succeeds in "
-                         f"{real[0] / real[1]:.0%} already: training in this model may make it worse.")
+        if real is not None:
+            criteria.append(_room(clone.replayed[clone.imagined], real, limits.success_margin))
     if not limits.require_success_agreement:
         notes.append("Agreement of imagined and real success was not asked for (acceptance.require_success_agreement).")
     elif imagined is None or real is None:
@@ -262,6 +265,17 @@ def _agreement(imagined: tuple[int, int], real: tuple[int, int], margin: float) 
         outcome = "failed"
     rule = f"interval within +-{margin:g}"
     return Criterion(name, gap, None, rule, outcome, POLICY_DATA, (low, high))
+
+
+def _room(right: BoolArray, real: tuple[int, int], margin: float) -> Criterion:
+    """Whether training can raise the policy: RL turns it to what the model calls a success, so that its real success
+    goes towards the share of its imagined successes that are real. Where that share is lower than what it has already,
+    this fails without waiting for more episodes: training would cost a good policy."""
+    gap = float(right.mean()) - real[0] / real[1] if len(right) else math.nan
+    low, high = newcombe_difference(int(right.sum()), len(right), *real)
+    outcome: Outcome = "failed" if gap < 0 else "passed" if gap >= 0 and low >= -margin else "undecided"
+    name = f"room to learn: done precision, cloned policy - its real success {real[0]}/{real[1]}"
+    return Criterion(name, gap, 0.0, f"interval above {-margin:g}, value >=", outcome, GOOD_ALREADY, (low, high))
 
 
 def _of_clone(kind: str, right: BoolArray, limit: float, config: RunConfig, remedy: str) -> Criterion:
