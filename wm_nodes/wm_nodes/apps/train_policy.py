@@ -47,6 +47,7 @@ from wm_nodes.reports.summary import Summary, acceptance_outcome, as_first_made,
 from wm_nodes.reports.tables import exploit_table, results_table, rounds_table, tasks_table
 from wm_nodes.training.run_record import Starter
 from wm_nodes.world_model.folder import model_spec, read_world_manifest
+from wm_nodes.world_model.validation.acceptance import GOOD_ALREADY, ROOM
 
 ENDOGENOUS = "endogenous"
 ACCEPTANCE = "acceptance.json"
@@ -275,6 +276,11 @@ def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, r
     path.write_text(json.dumps(report.to_dict(), indent=1), encoding="utf-8")
     console.print(report.table())
     if report.failed and not force:
+        if all(name.startswith(ROOM) for name in report.failed):
+            raise ModelNotAcceptedError(
+                f"{', '.join(report.failed)} failed (numbers in {path}): training could only lower this policy; "
+                f"{GOOD_ALREADY}, or go on with --force"
+            )
         again = "--from-scratch --preset cpu_full" if config.task else "wm train-model"
         raise ModelNotAcceptedError(
             f"{', '.join(report.failed)} failed (numbers in {path}): the policy would learn to exploit the model. "

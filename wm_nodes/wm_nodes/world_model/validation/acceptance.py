@@ -42,6 +42,7 @@ RECORDED_SUCCESSES = "record more episodes that succeed, or lower reward.success
 LOST_THINGS = "train the tokenizer longer (tokenizer.num_iterations), or with smaller patches (tokenizer.patch_px)"
 OTHER_ACTIONS = "record episodes in which the robot does different things from alike first frames, or train longer"
 POLICY_DATA = "refresh the model with more episodes of weak policies (data.policy_episodes)"
+ROOM = "room to learn"
 GOOD_ALREADY = (
     "keep this policy: it succeeds more often than what the model calls success is real; or refresh the model with its "
     "episodes (data.policy_episodes)"
@@ -274,7 +275,7 @@ def _room(right: BoolArray, real: tuple[int, int], margin: float) -> Criterion:
     gap = float(right.mean()) - real[0] / real[1] if len(right) else math.nan
     low, high = newcombe_difference(int(right.sum()), len(right), *real)
     outcome: Outcome = "failed" if gap < 0 else "passed" if gap >= 0 and low >= -margin else "undecided"
-    name = f"room to learn: done precision, cloned policy - its real success {real[0]}/{real[1]}"
+    name = f"{ROOM}: done precision, cloned policy - its real success {real[0]}/{real[1]}"
     return Criterion(name, gap, 0.0, f"interval above {-margin:g}, value >=", outcome, GOOD_ALREADY, (low, high))
 
 
