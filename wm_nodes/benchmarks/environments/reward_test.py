@@ -90,10 +90,11 @@ class RewardTest(Configured):
         wanted = {"config": config.model_dump(mode="json"), "world_model_sha256": models.sha256,
                   "episodes": self.episodes, "learned_from": self.learned_from}
         if not is_finished(rows, wanted):
-            seen = self._imagined(config, models, "train", NEW_CONTEXTS.take(self.learned_from), self.learned_from)
+            seen = episodes_learned_from(config, models, self.learned_from, self.work)
             heads = learned_heads(seen, model_dir, config.seed)
             for domain in splits():
-                found = self._imagined(config, models, domain, HELDOUT.take(self.episodes), self.episodes)
+                first = HELDOUT.take(self.episodes)
+                found = imagined_episodes(config, models, domain, first, self.episodes, self.work)
                 goals = goals_of(models, found.real, config)
                 scored = paid(found, goals, model_dir, config) | {name: head(found) for name, head in heads.items()}
                 for name, values in scored.items():
@@ -108,15 +109,23 @@ class RewardTest(Configured):
             for row in rows if is_finished([row], wanted)
         ]))
 
-    def _imagined(self, config: RunConfig, models: WorldModels, domain: str, first: int, count: int) -> Imagined:
-        chosen = config.with_values(
-            simulation=config.simulation.with_values(scenes=domain),
-            data=config.data.with_values(behaviours=BEHAVIOURS),
-        )
-        folder = self.work.absolute() / f"{self.task}_{domain}_{first}"
-        bags = collect_plan(task_plan(chosen, count, first), chosen, folder)
-        episodes = (episode for bag in bags for episode in read_episodes(bag))
-        return imagine_all(models, stack_episodes(episodes, [self.task]), self.task)
+
+def episodes_learned_from(config: RunConfig, models: WorldModels, count: int, work: Path) -> Imagined:
+    """Simulator episodes in training scenes, from which a reward may be learned."""
+    return imagined_episodes(config, models, "train", NEW_CONTEXTS.take(count), count, work)
+
+
+def imagined_episodes(
+    config: RunConfig, models: WorldModels, domain: str, first: int, count: int, work: Path
+) -> Imagined:
+    """Simulator episodes of config.task and BEHAVIOURS from seed `first` on, collected into `work` once, imagined."""
+    chosen = config.with_values(
+        simulation=config.simulation.with_values(scenes=domain),
+        data=config.data.with_values(behaviours=BEHAVIOURS),
+    )
+    bags = collect_plan(task_plan(chosen, count, first), chosen, work.absolute() / f"{config.task}_{domain}_{first}")
+    episodes = (episode for bag in bags for episode in read_episodes(bag))
+    return imagine_all(models, stack_episodes(episodes, [config.task]), config.task)
 
 
 def imagine_all(models: WorldModels, real: EpisodeArrays, task: str) -> Imagined:
@@ -189,28 +198,35 @@ def paid(
 
 
 def learned_heads(seen: Imagined, model_dir: Path, seed: int) -> dict[str, Callable[[Imagined], NDArray[np.float64]]]:
-    """Rewards learned from success in training scenes; each gives, up to every step, the largest value so far (E, T).
-
-    embedding head: linear, on the world model's features, least squares (iVideoGPT). proxy network: an MLP on the
-    tokenizer's latents of a frame (DiWA).
-    """
-    mask, success = seen.real.step_mask, seen.real.success[:, 1:, 0]
-    inputs = np.concatenate([seen.features, np.ones_like(seen.features[..., :1])], -1)[mask].astype(np.float64)
-    targets = success[mask].astype(np.float64)
-    weights = np.linalg.solve(inputs.T @ inputs + RIDGE * np.eye(inputs.shape[1]), inputs.T @ targets)
-
-    def embedding(found: Imagined) -> NDArray[np.float64]:
-        return largest(found.features.astype(np.float64) @ weights[:-1] + weights[-1], found)
-
-    encode = make_encoder(model_dir)
-    network = _train_proxy(_encoded(encode, seen.real.images[:, 1:])[mask], targets, seed)
+    """Rewards learned from success in training scenes; each gives the largest value up to every step (E, T)."""
+    weights, network, encode = embedding_weights(seen), proxy_network(seen, model_dir, seed), make_encoder(model_dir)
 
     def proxy(found: Imagined) -> NDArray[np.float64]:
         with torch.no_grad():
             values = network(torch.from_numpy(_encoded(encode, found.frames[:, 1:])))[..., 0].sigmoid()
         return largest(values.numpy().astype(np.float64), found)
 
-    return {"embedding head": embedding, "proxy network": proxy}
+    return {
+        "embedding head": lambda found: largest(found.features.astype(np.float64) @ weights[:-1] + weights[-1], found),
+        "proxy network": proxy,
+    }
+
+
+def embedding_weights(seen: Imagined) -> NDArray[np.float64]:
+    """Weights and bias (F + 1,) of success, linear in the world model's features, by least squares (iVideoGPT)."""
+    mask, success = seen.real.step_mask, seen.real.success[:, 1:, 0]
+    inputs = np.concatenate([seen.features, np.ones_like(seen.features[..., :1])], -1)[mask].astype(np.float64)
+    found: NDArray[np.float64] = np.linalg.solve(
+        inputs.T @ inputs + RIDGE * np.eye(inputs.shape[1]), inputs.T @ success[mask].astype(np.float64)
+    )
+    return found
+
+
+def proxy_network(seen: Imagined, model_dir: Path, seed: int) -> nn.Module:
+    """The logit of success (..., 1), an MLP on the tokenizer's latents of a frame (DiWA)."""
+    mask, success = seen.real.step_mask, seen.real.success[:, 1:, 0]
+    features = _encoded(make_encoder(model_dir), seen.real.images[:, 1:])[mask]
+    return _train_proxy(features, success[mask].astype(np.float64), seed)
 
 
 def largest(values: NDArray[np.float64], found: Imagined) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ from statistics import fmean
 from typing import Any, Literal, get_args
 
 from benchmarks.environments.experiments import Configured, is_finished
+from benchmarks.environments.learned_rewards import EMBEDDING, PROXY, Learned, environment_paid_by
 from benchmarks.environments.policies import SIMULATOR, WORLD_MODEL, Workplace, rate_of, train_on
 from benchmarks.experiment import console
 from benchmarks.video_rl.comparison import paired_interval
@@ -20,14 +21,19 @@ from wm_nodes.config.scenes import draw, splits
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.progress import tqdm
 from wm_nodes.reports.console_table import make_table
+from wm_nodes.world_model import ImaginedEpisodes
 
 TASKS = ("pick_place", "push", "pull", "move_to_aim")
-Training = Literal["sft", "one_scene", "all_scenes", "world_model"]
-SFT, ONE_SCENE, ALL_SCENES, MODEL = get_args(Training)
+Training = Literal["sft", "one_scene", "all_scenes", "world_model", "embedding", "proxy"]
+SFT, ONE_SCENE, ALL_SCENES, MODEL, *_ = get_args(Training)
 LABELS = {
     SFT: "SFT", ONE_SCENE: "RL in the simulator, its scene", ALL_SCENES: "RL in the simulator, all training scenes",
-    MODEL: "RL in the world model",
+    MODEL: "RL in the world model", "embedding": "the same, an embedding head pays",
+    "proxy": "the same, a proxy network pays",
 }
+LEARNED: dict[str, Learned] = {"embedding": EMBEDDING, "proxy": PROXY}
+LEARNED_FROM = 200
+"""Simulator episodes in training scenes that a learned reward has seen."""
 OOD, TRAIN = ("ood_object", "ood_combo"), "train"
 PAPER = {
     (SFT, "IND"): (12.0, 84.5, 57.7, 35.8), (SFT, "OOD"): (3.5, 13.3, 10.2, 10.6),
@@ -55,8 +61,9 @@ class RoboScape(Configured):
     """Columns."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Each has demonstrations and a scene of its own."""
-    trainings: tuple[Training, ...] = get_args(Training)
-    """Rows: the clone, and RL from it in the simulator on its scene, there on all training scenes, or in the model."""
+    trainings: tuple[Training, ...] = (SFT, ONE_SCENE, ALL_SCENES, MODEL)
+    """Rows: the clone, and RL from it in the simulator on its scene, there on all training scenes, or in the model; or
+    there paid by a reward that was learned from success, as iVideoGPT's head or DiWA's network (Figure 2)."""
     work: Path = Path("runs/roboscape")
     """Folder of first frames and policies; what is there is kept."""
 
@@ -68,7 +75,7 @@ class RoboScape(Configured):
             workplace = self.workplace(task, seed, own)
             wanted = {**workplace.identity(SIMULATOR, (own, *OOD)), "model": training, "task": task, "seed": seed}
             if not is_finished(rows, wanted):
-                rows.append({**wanted, **_cell(workplace, training, own)})
+                rows.append({**wanted, **_cell(workplace, training, own, self.work)})
                 self.write({"rows": rows}, device=workplace.config.device)
         self._show([row for row in rows if row["task"] in self.tasks and row["model"] in self.trainings])
 
@@ -92,13 +99,16 @@ class RoboScape(Configured):
                 console.print(f"OOD, {LABELS[MODEL]} less {LABELS[base]}, mean over tasks: {text} points")
 
 
-def _cell(workplace: Workplace, training: str, own: str) -> dict[str, Any]:
+def _cell(workplace: Workplace, training: str, own: str, work: Path) -> dict[str, Any]:
     """Train one policy and measure it in every column."""
-    config, policy, imagined, report = workplace.config, workplace.policy(), None, None
-    if training == MODEL:
+    config, policy, report = workplace.config, workplace.policy(), None
+    imagined: ImaginedEpisodes | None = None
+    if training == MODEL or training in LEARNED:
         imagined = workplace.environment(WORLD_MODEL)
         before = workplace.imagined(policy, imagined)
         report = workplace.acceptance(WORLD_MODEL, policy, before, workplace.real(policy, TRAIN))
+    if training in LEARNED:
+        imagined = environment_paid_by(LEARNED[training], workplace, LEARNED_FROM, work)
     course = list[float]()
     if training != SFT:
         words = f"{config.task}, seed {config.seed}, {LABELS[training]}"

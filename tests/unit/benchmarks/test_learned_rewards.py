@@ -1,0 +1,51 @@
+"""Rewards learned from success in place of the world model's done signal."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from model_folders import make_model_folder, write_starts
+from unit.benchmarks.test_reward_test import CONFIG, EPISODES, recorded
+
+from benchmarks.environments import learned_rewards, reward_test
+from benchmarks.environments.learned_rewards import EMBEDDING, PROXY, Learned, best_threshold, environment_paid_by
+from benchmarks.environments.reward_test import imagine_all, learned_heads
+from wm_nodes.policy_rl.factories import models_of
+
+
+def test_the_best_threshold_lies_between_scores() -> None:
+    scores, won = np.array([0.1, 0.4, 0.5, 0.9]), np.array([False, False, True, True])
+    assert best_threshold(scores, won) == pytest.approx(0.45)
+    assert best_threshold(scores, np.ones(4, np.bool_)) < 0.1
+    with pytest.raises(ValueError, match="none of 4 episodes succeeds"):
+        best_threshold(scores, np.zeros(4, np.bool_))
+
+
+@pytest.mark.parametrize("reward", [EMBEDDING, PROXY])
+def test_the_environment_ends_where_the_learned_reward_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reward: Learned
+) -> None:
+    """Under recorded actions, from the recordings' first frames, its signal is the reward's value, shifted."""
+    monkeypatch.setattr(reward_test, "PROXY_ITERATIONS", 20)
+    folder = make_model_folder(tmp_path / "model")
+    models, real = models_of(folder), recorded()
+    seen = imagine_all(models, real, "push_cube")
+    size = seen.features.shape[-1] + 1
+    for module in (reward_test, learned_rewards):  # least squares on 28 steps of noise would magnify rounding
+        monkeypatch.setattr(module, "embedding_weights", lambda _: np.random.default_rng(0).normal(0, 0.01, size))
+    monkeypatch.setattr(learned_rewards, "episodes_learned_from", lambda *_: seen)
+    images, states = seen.real.images[:, 0], seen.real.states[:, 0]
+    monkeypatch.setattr(learned_rewards, "load_starts", lambda *_: (images, states))
+    config = CONFIG.with_values(ppo=CONFIG.ppo.with_values(num_envs=EPISODES))
+    place: Any = SimpleNamespace(config=config, model_dir=folder, start=(write_starts(tmp_path / "starts"), None))
+    env = environment_paid_by(reward, place, EPISODES, tmp_path)
+    env.episodes.reset(torch.ones(EPISODES, dtype=torch.bool), torch.arange(EPISODES))
+    env._episode_ids[:] = 1
+    result = env.step(real.actions[:, 0])
+    values = learned_heads(seen, folder, 0)[reward](seen)
+    value, shift = values[:, 0], config.reward.success_threshold - best_threshold(values[:, -1], seen.won)
+    np.testing.assert_allclose(result.success_probability, value + shift, atol=2e-2)
+    assert (result.terminated == (result.success_probability > config.reward.success_threshold)).all()

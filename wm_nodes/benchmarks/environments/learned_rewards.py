@@ -1,0 +1,115 @@
+"""The world model with a reward learned from success in place of its done signal, to train policies in.
+
+Shapes: B batch, T steps, S tokens, D width, K done heads, J tasks, N environments, F features.
+"""
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from benchmarks.environments.policies import Workplace
+from benchmarks.environments.reward_test import (
+    embedding_weights,
+    episodes_learned_from,
+    learned_heads,
+    proxy_network,
+)
+from wm_nodes.core.types import BoolArray
+from wm_nodes.policy_rl.factories import models_of, run_spec
+from wm_nodes.world_model import DeviceEnvironment, ImaginedEpisodes
+from wm_nodes.world_model.starts import load_starts
+
+Learned = Literal["embedding head", "proxy network"]
+EMBEDDING, PROXY = get_args(Learned)
+
+
+class EmbeddingHead(nn.Module):
+    """A value linear in the pooled features, in place of DoneHeads: every head and task has it.
+
+    Args:
+        weights: and bias, (F + 1,).
+        like: the heads that it stands for.
+    """
+
+    def __init__(self, weights: NDArray[np.float64], like: Any) -> None:
+        super().__init__()
+        self.num_heads, self.num_tasks, self.num_positions = like.num_heads, like.num_tasks, 0
+        self.register_buffer("weights", torch.from_numpy(weights).float())
+
+    def forward(self, tokens_BTSD: Tensor, register_BTD: Tensor) -> tuple[Tensor, Tensor]:
+        """The logit of the value (B, T, K, J), inside (0, 1), and no positions."""
+        pooled = torch.cat((tokens_BTSD.mean(2), tokens_BTSD.amax(2), register_BTD), -1).float()
+        weights = self.get_buffer("weights")
+        logits = ((pooled * weights[:-1]).sum(-1) + weights[-1]).logit(1e-6)  # no bfloat16, as a matrix product would
+        return logits[..., None, None].expand(*logits.shape, self.num_heads, self.num_tasks), pooled[..., :0]
+
+
+class PaidByLatents(DeviceEnvironment):
+    """Its done signal is a value of the imagined latents.
+
+    Args:
+        value: features (N, F), see Tokenizer.flatten -> (N,). The others as DeviceEnvironment's.
+    """
+
+    def __init__(self, *args: Any, value: Callable[[Tensor], Tensor], **named: Any) -> None:
+        super().__init__(*args, **named)
+        self._value = value
+
+    def _predict(
+        self, actions_NA: Tensor, moved_NP: Tensor, valid_N: Tensor, noise: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        frames, _, spread = super()._predict(actions_NA, moved_NP, valid_N, noise)
+        return frames, self._value(self._tokenizer.flatten(self.imagined[0].latents_NSD, "latents")), 0 * spread
+
+
+def best_threshold(scores: NDArray[np.float64], won: BoolArray) -> float:
+    """The middle between two scores (E,) above which success has the best F1 with `won` (E,).
+
+    Raises:
+        ValueError: none has won.
+    """
+    if not won.any():
+        raise ValueError(f"none of {len(won)} episodes succeeds, and a reward is learned from success; take more")
+    ordered = np.unique(scores)
+    between = np.concatenate([[ordered[0] - 1], (ordered[1:] + ordered[:-1]) / 2])
+    called = scores[None] > between[:, None]
+    f1 = 2 * (called & won).sum(1) / np.maximum(called.sum(1) + won.sum(), 1)
+    return float(between[f1.argmax()])
+
+
+def environment_paid_by(reward: Learned, place: Workplace, episodes: int, work: Path) -> ImaginedEpisodes:
+    """The world model, whose episodes end in success where a learned reward says so.
+
+    The reward is learned from simulator episodes in training scenes; its value is shifted so that the one with the best
+    F1 on the imagined ones of them is reward.success_threshold.
+
+    Args:
+        episodes: that it is learned from. work: folder of these.
+
+    Raises:
+        ValueError: as best_threshold.
+    """
+    config, models = place.config, models_of(place.model_dir, place.config.device)
+    seen = episodes_learned_from(config, models, episodes, work)
+    scores = learned_heads(seen, place.model_dir, config.seed)[reward](seen)[:, -1]
+    shift = config.reward.success_threshold - best_threshold(scores, seen.won)
+    spec = replace(run_spec(config, place.model_dir), num_envs=config.ppo.num_envs)
+    starts = load_starts(place.start[0], spec.task)
+    given: dict[str, Any] = {"num_envs": config.ppo.num_envs, "with_goals": False}
+    if reward == EMBEDDING:
+        weights, action = embedding_weights(seen), copy.deepcopy(models.action)
+        weights[-1] += shift
+        action.done = EmbeddingHead(weights, action.done)  # type: ignore[assignment]
+        made = DeviceEnvironment(replace(models, action=action), spec, starts, config.reward, **given)
+    else:
+        network = proxy_network(seen, place.model_dir, config.seed)
+        given["value"] = lambda features: network(features.float())[..., 0].sigmoid() + shift
+        made = PaidByLatents(models, spec, starts, config.reward, **given)
+    return ImaginedEpisodes(made, seed=config.seed)
