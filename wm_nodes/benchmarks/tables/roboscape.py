@@ -1,41 +1,78 @@
 """Rows of the tables of docs/results/roboscape.md; what they are about stands in pages.yaml."""
 
 from collections.abc import Sequence
+from itertools import product
 from statistics import fmean
 
-from benchmarks.environments.roboscape import LABELS, MODEL, PAPER, TASKS, gain, success_of
-from benchmarks.tables.table import Rows, read
+from benchmarks.environments.roboscape import (
+    ALL_SCENES,
+    LABELS,
+    MODEL,
+    ONE_SCENE,
+    PAPER,
+    SFT,
+    TASKS,
+    gain,
+    success_of,
+)
+from benchmarks.tables.table import Rows, Run, interval, read
+from benchmarks.video_rl.comparison import paired_interval
 from wm_nodes.config.scenes import splits
 
 REWARDS, TABLE_1 = "roboscape_rewards.json", "roboscape_table1.json"
 DOMAINS = "IND", "OOD"
+POSITIONS = "positions"
+
+
+def trained(training: str, task: str, inputs: str = POSITIONS, dense: float = 0.0) -> list[Run]:
+    """Rows of Table 1 by seed. inputs: policy.inputs; dense: reward.dense_weight."""
+    found = [
+        row for row in read(TABLE_1)["rows"]
+        if (row["model"], row["task"], row["config"]["policy"]["inputs"]) == (training, task, inputs)
+        and row["config"]["reward"]["dense_weight"] == dense
+    ]
+    return sorted(found, key=lambda row: int(row["seed"]))
 
 
 def table_1() -> Rows:
-    found = read(TABLE_1)["rows"]
-    for task in [one for one in TASKS if any(row["task"] == one for row in found)]:
-        for training, label in LABELS.items():
-            of = sorted((r for r in found if (r["task"], r["model"]) == (task, training)), key=lambda r: r["seed"])
+    for task, inputs in product(TASKS, (POSITIONS, "latents")):
+        for training in (SFT, ONE_SCENE, ALL_SCENES, MODEL):
+            of = trained(training, task, inputs)
             if of:
                 papers = (PAPER.get((training, domain)) for domain in DOMAINS)
                 yield (
-                    task, label, *(by_seed([success_of(row, domain) for row in of]) for domain in DOMAINS),
+                    task, f"{inputs}, {of[0]['config']['sft']['num_demonstrations']}", LABELS[training],
+                    *(by_seed([success_of(row, domain) for row in of]) for domain in DOMAINS),
                     ", ".join("yes" if row["accepted"] else "no" for row in of) if training == MODEL else "",
                     *("" if paper is None else paper[TASKS.index(task)] for paper in papers),
                 )
 
 
+def table_1_gains() -> Rows:
+    for inputs, base, task in product((POSITIONS, "latents"), (SFT, ONE_SCENE, ALL_SCENES), TASKS):
+        if text := gain([*trained(MODEL, task, inputs), *trained(base, task, inputs)], base):
+            yield task, inputs, LABELS[base], text
+
+
+def figure_2() -> Rows:
+    base = {row["seed"]: success_of(row, "OOD") for row in trained(MODEL, "push")}
+    arms = {
+        "done signal": trained(MODEL, "push"), "goal distance and done signal": trained(MODEL, "push", dense=1.0),
+        "embedding head (iVideoGPT)": trained("embedding", "push"), "proxy network (DiWA)": trained("proxy", "push"),
+    }
+    for name, of in arms.items():
+        if of:
+            differences = [success_of(row, "OOD") - base[row["seed"]] for row in of]
+            apart = "" if name == "done signal" else f"{fmean(differences):+.1f}"
+            if apart and len(of) > 1:
+                over = paired_interval(differences)
+                apart = interval(over.mean, over.low, over.high, 1)
+            yield name, *(by_seed([success_of(row, domain) for row in of]) for domain in DOMAINS), apart
+
+
 def by_seed(rates: Sequence[float]) -> str:
     text = f"{fmean(rates):.1f}"
     return text if len(rates) == 1 else f"{text} ({', '.join(f'{rate:.0f}' for rate in rates)})"
-
-
-def table_1_gains() -> Rows:
-    found = read(TABLE_1)["rows"]
-    for base in (one for one in LABELS if one != MODEL):
-        for task in [one for one in TASKS if any(row["task"] == one for row in found)]:
-            if text := gain([row for row in found if row["task"] == task], base):
-                yield task, LABELS[base], text
 
 
 def rewards() -> Rows:
