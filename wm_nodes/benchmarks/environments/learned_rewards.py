@@ -16,10 +16,11 @@ from torch import Tensor, nn
 
 from benchmarks.environments.policies import Workplace
 from benchmarks.environments.reward_test import (
+    embedding_values,
     embedding_weights,
     episodes_learned_from,
-    learned_heads,
     proxy_network,
+    proxy_values,
 )
 from wm_nodes.core.types import BoolArray
 from wm_nodes.policy_rl.factories import models_of, run_spec
@@ -98,18 +99,21 @@ def environment_paid_by(reward: Learned, place: Workplace, episodes: int, work: 
     """
     config, models = place.config, models_of(place.model_dir, place.config.device)
     seen = episodes_learned_from(config, models, episodes, work)
-    scores = learned_heads(seen, place.model_dir, config.seed)[reward](seen)[:, -1]
-    shift = config.reward.success_threshold - best_threshold(scores, seen.won)
     spec = replace(run_spec(config, place.model_dir), num_envs=config.ppo.num_envs)
     starts = load_starts(place.start[0], spec.task)
     given: dict[str, Any] = {"num_envs": config.ppo.num_envs, "with_goals": False}
+
+    def shift(values: NDArray[np.float64]) -> float:
+        return config.reward.success_threshold - best_threshold(values[:, -1], seen.won)
+
     if reward == EMBEDDING:
         weights, action = embedding_weights(seen), copy.deepcopy(models.action)
-        weights[-1] += shift
+        weights[-1] += shift(embedding_values(weights, seen))
         action.done = EmbeddingHead(weights, action.done)  # type: ignore[assignment]
         made = DeviceEnvironment(replace(models, action=action), spec, starts, config.reward, **given)
     else:
         network = proxy_network(seen, place.model_dir, config.seed)
-        given["value"] = lambda features: network(features.float())[..., 0].sigmoid() + shift
+        more = shift(proxy_values(network, place.model_dir, seen))
+        given["value"] = lambda features: network(features.float())[..., 0].sigmoid() + more
         made = PaidByLatents(models, spec, starts, config.reward, **given)
     return ImaginedEpisodes(made, seed=config.seed)

@@ -199,17 +199,21 @@ def paid(
 
 def learned_heads(seen: Imagined, model_dir: Path, seed: int) -> dict[str, Callable[[Imagined], NDArray[np.float64]]]:
     """Rewards learned from success in training scenes; each gives the largest value up to every step (E, T)."""
-    weights, network, encode = embedding_weights(seen), proxy_network(seen, model_dir, seed), make_encoder(model_dir)
-
-    def proxy(found: Imagined) -> NDArray[np.float64]:
-        with torch.no_grad():
-            values = network(torch.from_numpy(_encoded(encode, found.frames[:, 1:])))[..., 0].sigmoid()
-        return largest(values.numpy().astype(np.float64), found)
-
+    weights, network = embedding_weights(seen), proxy_network(seen, model_dir, seed)
     return {
-        "embedding head": lambda found: largest(found.features.astype(np.float64) @ weights[:-1] + weights[-1], found),
-        "proxy network": proxy,
+        "embedding head": lambda found: embedding_values(weights, found),
+        "proxy network": lambda found: proxy_values(network, model_dir, found),
     }
+
+
+def embedding_values(weights: NDArray[np.float64], found: Imagined) -> NDArray[np.float64]:
+    return largest(found.features.astype(np.float64) @ weights[:-1] + weights[-1], found)
+
+
+def proxy_values(network: nn.Module, model_dir: Path, found: Imagined) -> NDArray[np.float64]:
+    with torch.no_grad():
+        values = network(torch.from_numpy(_encoded(make_encoder(model_dir), found.frames[:, 1:])))[..., 0].sigmoid()
+    return largest(values.numpy().astype(np.float64), found)
 
 
 def embedding_weights(seen: Imagined) -> NDArray[np.float64]:
