@@ -171,6 +171,7 @@ def test_a_model_that_only_scripted_episodes_speak_for_is_refused_by_the_cloned_
         ((91, 100), clone(46, 13, 3), "failed"),
         ((70, 100), clone(46, 13, 3), "passed"),
         ((70, 100), clone(3, 1, 3), "undecided"),
+        ((17, 100), clone(1, 7, 2), "undecided"),  # 12 % of eight: RL from this clone won 59 points
         ((70, 100), clone(0, 0, 3), "undecided"),
     ],
 )

@@ -270,11 +270,15 @@ def _agreement(imagined: tuple[int, int], real: tuple[int, int], margin: float) 
 
 def _room(right: BoolArray, real: tuple[int, int], margin: float) -> Criterion:
     """Whether training can raise the policy: RL turns it to what the model calls a success, so that its real success
-    goes towards the share of its imagined successes that are real. Where that share is lower than what it has already,
-    this fails without waiting for more episodes: training would cost a good policy."""
+    goes towards the share of its imagined successes that are real. It fails where that share is lower than what it has
+    and the interval leaves no gain above the margin, so that a good policy is kept; few episodes decide nothing."""
     gap = float(right.mean()) - real[0] / real[1] if len(right) else math.nan
     low, high = newcombe_difference(int(right.sum()), len(right), *real)
-    outcome: Outcome = "failed" if gap < 0 else "passed" if gap >= 0 and low >= -margin else "undecided"
+    outcome: Outcome = "undecided"
+    if gap < 0 and high <= margin:
+        outcome = "failed"
+    elif gap >= 0 and low >= -margin:
+        outcome = "passed"
     name = f"{ROOM}: done precision, cloned policy - its real success {real[0]}/{real[1]}"
     return Criterion(name, gap, 0.0, f"interval above {-margin:g}, value >=", outcome, GOOD_ALREADY, (low, high))
 
