@@ -25,6 +25,7 @@ from benchmarks.environments.reward_test import (
 from wm_nodes.core.types import BoolArray
 from wm_nodes.policy_rl.factories import models_of, run_spec
 from wm_nodes.world_model import DeviceEnvironment, ImaginedEpisodes
+from wm_nodes.world_model.dynamics import pooled_features
 from wm_nodes.world_model.starts import load_starts
 
 Learned = Literal["embedding head", "proxy network"]
@@ -41,12 +42,12 @@ class EmbeddingHead(nn.Module):
 
     def __init__(self, weights: NDArray[np.float64], like: Any) -> None:
         super().__init__()
-        self.num_heads, self.num_tasks, self.num_positions = like.num_heads, like.num_tasks, 0
+        self.num_heads, self.num_tasks = like.num_heads, like.num_tasks
         self.register_buffer("weights", torch.from_numpy(weights).float())
 
     def forward(self, tokens_BTSD: Tensor, register_BTD: Tensor) -> tuple[Tensor, Tensor]:
         """The logit of the value (B, T, K, J), inside (0, 1), and no positions."""
-        pooled = torch.cat((tokens_BTSD.mean(2), tokens_BTSD.amax(2), register_BTD), -1).float()
+        pooled = pooled_features(tokens_BTSD, register_BTD).float()
         weights = self.get_buffer("weights")
         logits = ((pooled * weights[:-1]).sum(-1) + weights[-1]).logit(1e-6)  # no bfloat16, as a matrix product would
         return logits[..., None, None].expand(*logits.shape, self.num_heads, self.num_tasks), pooled[..., :0]

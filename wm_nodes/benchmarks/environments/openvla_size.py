@@ -1,6 +1,5 @@
 """Memory and arithmetic of OpenVLA as a policy at its published size; on a GPU also its time, with random weights."""
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from statistics import median
@@ -13,8 +12,9 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.experiment import Count, OnDevice, console
+from benchmarks.video_rl.public_size import clock, default_dtype, free, peak_gib
 from wm_nodes.config.load import load_config
-from wm_nodes.core.device import CPU, synchronize
+from wm_nodes.core.device import CPU
 from wm_nodes.environments.registry import configured_spec
 from wm_nodes.policy_rl.openvla.model import OpenVla
 from wm_nodes.policy_rl.openvla.policy import OpenVlaPolicy
@@ -64,7 +64,8 @@ class OpenVlaSize(OnDevice):
     """Of the adapter."""
 
     def run(self) -> None:
-        where, row = self.where, counted(published(torch.device("meta"), self.seed))
+        where = self.where
+        row: dict[str, float | None] = dict(counted(published(torch.device("meta"), self.seed)))
         if where.type != CPU:
             row |= measured(published(where, self.seed), self.pictures, where)
         self.write({"rows": [row], "seed": self.seed, "pictures": self.pictures}, device=self.device)
@@ -114,16 +115,11 @@ def _linear(name: str, inputs: int, outputs: int) -> dict[str, Tensor]:
 
 def published(device: torch.device, seed: int) -> OpenVlaPolicy:
     """The policy of the published size in bfloat16 on a device; on `meta` without weights."""
-    standard = torch.get_default_dtype()
-    try:
-        torch.set_default_dtype(torch.bfloat16)
-        with device:
-            config, tensors = checkpoint(LLAMA_2, (DINO, SIGLIP))
-            network = OpenVla(config, tensors, [1] * PROMPT_TOKENS)
-            settings = load_config("cpu", {"task": TASK, "simulation.scenes": "train"})
-            return OpenVlaPolicy(network, settings.policy, configured_spec(settings), seed=seed)
-    finally:
-        torch.set_default_dtype(standard)
+    settings = load_config("cpu", {"task": TASK, "simulation.scenes": "train"})
+    with default_dtype(torch.bfloat16), device:
+        config, tensors = checkpoint(LLAMA_2, (DINO, SIGLIP))
+        network = OpenVla(config, tensors, [1] * PROMPT_TOKENS)
+        return OpenVlaPolicy(network, settings.policy, configured_spec(settings), seed=seed)
 
 
 def counted(policy: OpenVlaPolicy) -> dict[str, float]:
@@ -154,7 +150,7 @@ def counted(policy: OpenVlaPolicy) -> dict[str, float]:
     }
 
 
-def measured(policy: OpenVlaPolicy, pictures: int, device: torch.device) -> dict[str, float]:
+def measured(policy: OpenVlaPolicy, pictures: int, device: torch.device) -> dict[str, float | None]:
     """Seconds a picture to act and to train, the median of REPEATS after one, and GiB at the peaks."""
     images = np.zeros((pictures, policy.side, policy.side, 3), np.uint8)
     states = np.zeros((pictures, policy.state_dim), np.float32)
@@ -166,17 +162,15 @@ def measured(policy: OpenVlaPolicy, pictures: int, device: torch.device) -> dict
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
 
-    found = dict[str, float]()
+    found = dict[str, float | None]()
     for name, run in (("act", lambda: policy.act(images, states, noise=noise)), ("train", train)):
-        torch.cuda.reset_peak_memory_stats(device)
+        free(device)
         seconds = list[float]()
         for _ in range(1 + REPEATS):
-            start = time.perf_counter()
+            start = clock(device)
             run()
-            synchronize(device)
-            seconds.append(time.perf_counter() - start)
-        found[f"{name}_s_per_picture"] = median(seconds[1:]) / pictures
-        found[f"{name}_gib"] = torch.cuda.max_memory_allocated(device) / 2**30
+            seconds.append(clock(device) - start)
+        found |= {f"{name}_s_per_picture": median(seconds[1:]) / pictures, f"{name}_gib": peak_gib(device)}
     return found
 
 

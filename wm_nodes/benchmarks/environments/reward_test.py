@@ -32,6 +32,7 @@ from wm_nodes.recording import read_episodes
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.reward import EncoderDistance, EndogenousReward, RewardInput
+from wm_nodes.world_model.dynamics import pooled_features
 from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.text import ImaginedGoals, imagine_goals
 from wm_nodes.world_model.validation.open_loop import BATCH, ImaginedEpisodes, imagine
@@ -134,7 +135,7 @@ def imagine_all(models: WorldModels, real: EpisodeArrays, task: str) -> Imagined
 
     def keep(module: nn.Module, inputs: tuple[Tensor, Tensor], _: object) -> None:
         tokens, register = inputs
-        seen.append(torch.cat((tokens.mean(2), tokens.amax(2), register), -1).float()[:, 0])
+        seen.append(pooled_features(tokens, register).float()[:, 0])
 
     features = list[FloatArray]()
     hook = models.action.done.register_forward_hook(keep)

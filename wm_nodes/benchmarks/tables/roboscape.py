@@ -24,10 +24,12 @@ DOMAINS = "IND", "OOD"
 POSITIONS = "positions"
 
 
-def trained(training: str, task: str, inputs: str = POSITIONS, dense: float = 0.0) -> list[Run]:
-    """Rows of Table 1 by seed. inputs: policy.inputs; dense: reward.dense_weight."""
+def trained(
+    rows: Sequence[Run], training: str, task: str, inputs: str = POSITIONS, dense: float = 0.0
+) -> list[Run]:
+    """Those of the rows of Table 1, by seed. inputs: policy.inputs; dense: reward.dense_weight."""
     found = [
-        row for row in read(TABLE_1)["rows"]
+        row for row in rows
         if (row["model"], row["task"], row["config"]["policy"]["inputs"]) == (training, task, inputs)
         and row["config"]["reward"]["dense_weight"] == dense
     ]
@@ -35,9 +37,10 @@ def trained(training: str, task: str, inputs: str = POSITIONS, dense: float = 0.
 
 
 def table_1() -> Rows:
+    found = read(TABLE_1)["rows"]
     for task, inputs in product(TASKS, (POSITIONS, "latents")):
         for training, dense in ((SFT, 0), (ONE_SCENE, 0), (ALL_SCENES, 0), (MODEL, 0), (MODEL, 1)):
-            of = trained(training, task, inputs, dense)
+            of = trained(found, training, task, inputs, dense)
             if of:
                 papers = (PAPER.get((training, domain)) for domain in DOMAINS)
                 yield (
@@ -51,16 +54,20 @@ def table_1() -> Rows:
 
 
 def table_1_gains() -> Rows:
+    found = read(TABLE_1)["rows"]
     for dense, inputs, base, task in product((0, 1), (POSITIONS, "latents"), (SFT, ONE_SCENE, ALL_SCENES), TASKS):
-        if text := gain([*trained(MODEL, task, inputs, dense), *trained(base, task, inputs)], base):
+        if text := gain([*trained(found, MODEL, task, inputs, dense), *trained(found, base, task, inputs)], base):
             yield task, inputs, "done signal and goal" if dense else "done signal", LABELS[base], text
 
 
 def figure_2() -> Rows:
-    base = {row["seed"]: success_of(row, "OOD") for row in trained(MODEL, "push")}
+    found = read(TABLE_1)["rows"]
+    done = trained(found, MODEL, "push")
+    base = {row["seed"]: success_of(row, "OOD") for row in done}
     arms = {
-        "done signal": trained(MODEL, "push"), "goal distance and done signal": trained(MODEL, "push", dense=1.0),
-        "embedding head (iVideoGPT)": trained("embedding", "push"), "proxy network (DiWA)": trained("proxy", "push"),
+        "done signal": done, "goal distance and done signal": trained(found, MODEL, "push", dense=1.0),
+        "embedding head (iVideoGPT)": trained(found, "embedding", "push"),
+        "proxy network (DiWA)": trained(found, "proxy", "push"),
     }
     for name, of in arms.items():
         if of:

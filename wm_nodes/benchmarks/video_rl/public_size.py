@@ -5,7 +5,8 @@ Shapes: C channels, F latent frames, H W latent grid, K given frames, L text tok
 
 import gc
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -158,13 +159,8 @@ def random_velocity(size: Size, seed: int, device: torch.device) -> PublicVeloci
     """A network with its adapter, drawn where it computes, in the number formats that diffusers loads it in."""
     diffusers = package("diffusers")
     kind = diffusers.CosmosTransformer3DModel if size.cosmos else diffusers.WanTransformer3DModel
-    standard = torch.get_default_dtype()
-    try:
-        torch.set_default_dtype(torch.bfloat16)
-        with initial_weights(seed, "public_size"), device:
-            transformer: nn.Module = kind(**size.settings)
-    finally:
-        torch.set_default_dtype(standard)
+    with default_dtype(torch.bfloat16), initial_weights(seed, "public_size"), device:
+        transformer: nn.Module = kind(**size.settings)
     exact = set(kind._keep_in_fp32_modules or ())
     for name, parameter in transformer.named_parameters():
         if exact & set(name.split(".")):
@@ -173,6 +169,17 @@ def random_velocity(size: Size, seed: int, device: torch.device) -> PublicVeloci
     velocity = CosmosVelocity(transformer) if size.cosmos else WanVelocity(transformer, fused=bool(size.given))
     add_lora(velocity, RANK, ALPHA, seed=seed)
     return velocity.to(device)
+
+
+@contextmanager
+def default_dtype(dtype: torch.dtype) -> Iterator[None]:
+    """What is drawn meanwhile has this number format."""
+    standard = torch.get_default_dtype()
+    try:
+        torch.set_default_dtype(dtype)
+        yield
+    finally:
+        torch.set_default_dtype(standard)
 
 
 def once(

@@ -34,6 +34,11 @@ class Prediction:
     """Of frame t + 1, per head and task."""
 
 
+def pooled_features(tokens_BTSD: Tensor, register_BTD: Tensor) -> Tensor:
+    """What done heads see of the last layer, (B, T, 3 D): mean and maximum over the tokens, and the register."""
+    return torch.cat((tokens_BTSD.mean(2), tokens_BTSD.amax(2), register_BTD), -1)
+
+
 class DoneHeads(nn.Module):
     """K independent MLPs on the frame's pooled temporal features; the minimum over heads is the done signal.
 
@@ -58,7 +63,7 @@ class DoneHeads(nn.Module):
 
     def forward(self, tokens_BTSD: Tensor, register_BTD: Tensor) -> tuple[Tensor, Tensor]:
         """Done logits (B, T, K, J) and positions (B, T, num_positions), float32."""
-        pooled = torch.cat((tokens_BTSD.mean(2), tokens_BTSD.amax(2), register_BTD), -1)
+        pooled = pooled_features(tokens_BTSD, register_BTD)
         positions = pooled[..., :0].float()
         if self.positions is not None:
             positions = self.positions(pooled).float()
