@@ -13,18 +13,19 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.types import Rollout
 from wm_nodes.environments.maniskill.spec import simulation_spec
-from wm_nodes.policy_rl.device_rollout import MOST_HASHED_STARTS, DeviceCollector, Step, rollout_starts
+from wm_nodes.policy_rl.device_rollout import MOST_HASHED_STARTS, DeviceCollector, Step, make_collector, rollout_starts
 from wm_nodes.policy_rl.factories import (
     make_device_environment,
     make_endogenous_reward,
     make_imagined_environment,
     make_policy,
+    make_reward,
     models_of,
 )
 from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.policy_rl.rollouts import TensorRollout, collect_rollout, rollout_statistics, tensors_of
 from wm_nodes.policy_rl.train import train_policy
-from wm_nodes.reward import RewardModel, RuleReward
+from wm_nodes.reward import RewardInput, RewardModel, RuleReward
 from wm_nodes.world_model import DeviceEnvironment, load_starts, precision
 
 STEPS = 9
@@ -97,6 +98,35 @@ def test_the_dense_reward_is_that_of_the_reward_model_and_a_missing_goal_is_miss
     assert len(np.unique(rewards)) > 10
     assert np.isnan(lockstep.rewards_TN[0]).any() and np.isfinite(lockstep.rewards_TN[0]).any()
     assert_same(lockstep, found)
+
+
+def test_progress_is_that_of_the_reward_model_along_the_golden_trajectory_of_the_start() -> None:
+    config = config_of(reward__dense_weight=1.0, reward__mode="progress", reward__goal_threshold=0.5,
+                       reward__sparse_weight=0.0, simulation__max_episode_steps=6, reward__success_threshold=1.0)
+    reward, policy = make_endogenous_reward(config, MODEL), make_policy(config, MODEL)
+    env = make_imagined_environment(config, MODEL, MODEL / STARTS, num_envs=8, seed=3)
+    found = make_collector(env, policy, reward)(5, 5, 2)
+    assert isinstance(found, TensorRollout) and env.episodes.golden is not None
+    golden, starts = env.episodes.golden, rollout_starts(5, 2, 1, 8, 64)[0]
+    pictures, valid = found.pictures(), np.ones(8, np.bool_)
+    for step in range(5):
+        told = reward.evaluate(RewardInput(
+            pictures[step], pictures[step + 1], np.zeros(8, np.float32), valid, np.zeros(8, np.float32),
+            goals=golden.goals[starts], goal_found=golden.found[starts], golden=golden.frames[starts],
+            golden_lengths=golden.lengths[starts],
+        ))
+        np.testing.assert_allclose(found.rewards_TN[step].numpy(), told.total, atol=1e-6)
+    paid = found.rewards_TN[torch.isfinite(found.rewards_TN)]
+    assert (paid != 0).any() and paid.abs().max() <= config.reward.dense_clip
+
+
+def test_progress_is_refused_where_every_step_is_paid_by_itself() -> None:
+    config = config_of(reward__dense_weight=1.0, reward__mode="progress")
+    with pytest.raises(ValueError, match=r"reward\.mode progress compares with golden .* or choose delta"):
+        make_reward(config, MODEL)
+    other = device_environment(config_of(reward__dense_weight=1.0), 2)
+    with pytest.raises(ValueError, match="this environment was made for another mode"):
+        DeviceCollector(other, make_policy(config, MODEL), make_endogenous_reward(config, MODEL))
 
 
 def test_token_models_take_the_same_path(tmp_path: Path) -> None:

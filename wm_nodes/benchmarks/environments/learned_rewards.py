@@ -6,6 +6,7 @@ Shapes: B batch, T steps, S tokens, D width, K done heads, J tasks, N environmen
 import copy
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -23,10 +24,9 @@ from benchmarks.environments.reward_test import (
     proxy_values,
 )
 from wm_nodes.core.types import BoolArray
-from wm_nodes.policy_rl.factories import models_of, run_spec
-from wm_nodes.world_model import DeviceEnvironment, ImaginedEpisodes
+from wm_nodes.policy_rl.factories import imagined_by, models_of
+from wm_nodes.world_model import DeviceEnvironment, ImaginedEpisodes, WorldModels
 from wm_nodes.world_model.dynamics import pooled_features
-from wm_nodes.world_model.starts import load_starts
 
 Learned = Literal["embedding head", "proxy network"]
 EMBEDDING, PROXY = get_args(Learned)
@@ -100,9 +100,6 @@ def environment_paid_by(reward: Learned, place: Workplace, episodes: int, work: 
     """
     config, models = place.config, models_of(place.model_dir, place.config.device)
     seen = episodes_learned_from(config, models, episodes, work)
-    spec = replace(run_spec(config, place.model_dir), num_envs=config.ppo.num_envs)
-    starts = load_starts(place.start[0], spec.task)
-    given: dict[str, Any] = {"num_envs": config.ppo.num_envs, "with_goals": False}
 
     def shift(values: NDArray[np.float64]) -> float:
         return config.reward.success_threshold - best_threshold(values[:, -1], seen.won)
@@ -111,10 +108,12 @@ def environment_paid_by(reward: Learned, place: Workplace, episodes: int, work: 
         weights, action = embedding_weights(seen), copy.deepcopy(models.action)
         weights[-1] += shift(embedding_values(weights, seen))
         action.done = EmbeddingHead(weights, action.done)  # type: ignore[assignment]
-        made = DeviceEnvironment(replace(models, action=action), spec, starts, config.reward, **given)
+
+        def make(models: WorldModels, *args: Any, **named: Any) -> DeviceEnvironment:
+            return DeviceEnvironment(replace(models, action=action), *args, **named)
     else:
         network = proxy_network(seen, place.model_dir, config.seed)
         more = shift(proxy_values(network, place.model_dir, seen))
-        given["value"] = lambda features: network(features.float())[..., 0].sigmoid() + more
-        made = PaidByLatents(models, spec, starts, config.reward, **given)
+        make = partial(PaidByLatents, value=lambda features: network(features.float())[..., 0].sigmoid() + more)
+    made = imagined_by(make, config, place.model_dir, place.start[0], config.ppo.num_envs)
     return ImaginedEpisodes(made, seed=config.seed)

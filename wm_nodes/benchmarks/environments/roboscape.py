@@ -68,7 +68,7 @@ class RoboScape(Configured):
     """Folder of first frames and policies; what is there is kept."""
 
     def run(self) -> None:
-        rows = self.read()
+        rows, shown = self.read(), list[dict[str, Any]]()
         cells = [(task, seed, name) for task in self.tasks for seed in self.seeds for name in self.trainings]
         for task, seed, training in tqdm(cells, desc="cells", unit="cell"):
             own = scene_of_seed(seed)
@@ -77,7 +77,8 @@ class RoboScape(Configured):
             if not is_finished(rows, wanted):
                 rows.append({**wanted, **_cell(workplace, training, own, self.work)})
                 self.write({"rows": rows}, device=workplace.config.device)
-        self._show([row for row in rows if row["task"] in self.tasks and row["model"] in self.trainings])
+            shown += [row for row in rows if is_finished([row], wanted)]
+        self._show(shown)
 
     def workplace(self, task: str, seed: int, own: str) -> Workplace:
         given = {"sft.scenes": own, **self.settings, "task": task, "seed": seed}

@@ -25,13 +25,13 @@ POSITIONS = "positions"
 
 
 def trained(
-    rows: Sequence[Run], training: str, task: str, inputs: str = POSITIONS, dense: float = 0.0
+    rows: Sequence[Run], training: str, task: str, inputs: str = POSITIONS, dense: float = 0.0, mode: str = "delta"
 ) -> list[Run]:
-    """Those of the rows of Table 1, by seed. inputs: policy.inputs; dense: reward.dense_weight."""
+    """Those of the rows of Table 1, by seed. inputs: policy.inputs; dense, mode: of the reward."""
     found = [
         row for row in rows
         if (row["model"], row["task"], row["config"]["policy"]["inputs"]) == (training, task, inputs)
-        and row["config"]["reward"]["dense_weight"] == dense
+        and (row["config"]["reward"]["dense_weight"], row["config"]["reward"].get("mode", "delta")) == (dense, mode)
     ]
     return sorted(found, key=lambda row: int(row["seed"]))
 

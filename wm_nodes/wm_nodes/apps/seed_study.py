@@ -256,7 +256,7 @@ def _train(
     meter: ExploitMeter | None = None,
 ) -> list[dict[str, float]]:
     """Train in place; return success rate, KL and environment steps of each update."""
-    reward = make_reward(config, None if arm == "simulator" else model_dir)
+    reward = make_reward(config, None if arm == "simulator" else model_dir, golden=True)
     course: list[dict[str, float]] = []
     with tqdm(total=config.ppo.updates, desc=f"{config.task} seed {config.seed} in {arm}", unit="update") as bar:
         for rollout, metrics in train_policy(policy, env, reward, config, meter):

@@ -191,7 +191,8 @@ class VideoEnvironmentConfig(SettingsSection):
 
 class RewardConfig(SettingsSection):
     mode: Literal["delta", "abs", "progress"]
-    """Dense reward (RS-5): change of the goal distance, its level, or progress along the golden trajectory."""
+    """Dense reward (RS-5): change of the goal distance, its level, or progress along the golden trajectory, in rollouts
+    that stay on the model's device."""
     dense_weight: NonNegativeFloat
     """Factor of the dense reward; 0: no goal is needed."""
     sparse_weight: NonNegativeFloat
@@ -206,6 +207,11 @@ class RewardConfig(SettingsSection):
     """An imagined step above it pays no sparse reward and truncates the episode; 0: off."""
     factory: FactoryName = ""
     """module:callable(config) -> RewardModel (reward/base.py) instead of the built-in one; empty: none."""
+
+    @property
+    def needs_golden(self) -> bool:
+        """Whether golden trajectories are compared with, not goals alone."""
+        return self.mode == "progress" and self.dense_weight > 0
 
 
 class PolicyConfig(SettingsSection):

@@ -27,7 +27,8 @@ from wm_nodes.policy_rl.rollouts import (
     reset_seeds,
 )
 from wm_nodes.reward import EncoderDistance, EndogenousReward, RewardModel
-from wm_nodes.world_model import DeviceEnvironment
+from wm_nodes.reward.endogenous import progress_along
+from wm_nodes.world_model import DeviceEnvironment, ImaginedEnvironment
 from wm_nodes.world_model.starts import start_of
 
 MOST_HASHED_STARTS = 1024
@@ -56,14 +57,17 @@ def rollout_starts(
 def make_collector(
     env: Environment | DeviceEnvironment, policy: ImagePolicy, reward: RewardModel, envs_per_start: int = 1
 ) -> Callable[[int, int, int], Rollout | TensorRollout]:
-    """Return collect(steps, seed, policy version): on the device where `env` is a DeviceEnvironment, else lock-step."""
+    """Return collect(steps, seed, policy version): on the device where `env` is a DeviceEnvironment, or the reward
+    follows golden trajectories, which stay there; else lock-step."""
+    if isinstance(env, ImaginedEnvironment) and isinstance(reward, EndogenousReward) and reward.config.needs_golden:
+        env = DeviceEnvironment.beside(env)
     if isinstance(env, DeviceEnvironment):
         return partial(DeviceCollector(env, policy, reward).collect, envs_per_start=envs_per_start)
     return partial(collect_rollout, env, policy, reward, envs_per_start=envs_per_start)
 
 
 class DeviceCollector:
-    """Makes rollouts of `policy` in `env` with the endogenous reward (sparse; dense with mode delta or abs).
+    """Makes rollouts of `policy` in `env` with the endogenous reward.
 
     The policy is read where it is: train it in place.
 
@@ -203,24 +207,43 @@ class DeviceCollector:
         valid = columns["valid"] & torch.isfinite(signal) & torch.isfinite(spread)
         rewards = reward.config.sparse_weight * reward.crossed(signal, spread).float()
         if self._goals is not None:
-            goals, found = self._goals
+            goals, found, _ = self._goals
             latents = columns.get("latents", columns["features"][..., : goals.shape[-1]])  # without positions
-            wanted = goals[columns["starts"]]
-            before, after = (_distance_of(reward).between(f, wanted) for f in (latents[:-1], latents[1:]))
-            dense = reward.config.dense_weight * reward.approach(before, after)
+            dense = reward.config.dense_weight * torch.stack([
+                reward.approach(self._near(before, starts), self._near(after, starts))
+                for before, after, starts in zip(latents[:-1], latents[1:], columns["starts"], strict=True)
+            ])
             valid = valid & found[columns["starts"]] & torch.isfinite(dense)
             rewards = dense + rewards
         return torch.where(valid, rewards, float("nan")), valid
 
-    def _encode_goals(self) -> tuple[Tensor, Tensor] | None:
-        """Features (M, F) and found flags (M,) of the starts' goals; None where the reward needs no goal."""
+    def _near(self, latents_NF: Tensor, starts_N: Tensor) -> Tensor:
+        """How near to the goals of their starts the frames are (N,), see EndogenousReward.approach."""
+        assert self._goals is not None  # _rewards has looked
+        goals, _, lengths = self._goals
+        distances = _distance_of(self._reward).between(latents_NF.unsqueeze(1), goals[starts_N])
+        if self._reward.config.mode == "progress":
+            return progress_along(distances, lengths[starts_N])
+        return 1 - distances[:, 0]
+
+    def _encode_goals(self) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Features (M, K, F) of the starts' goals, one each, or of their golden trajectories, found flags (M,), and how
+        many frames count (M,); None where the reward needs no goal."""
         if self._reward.config.dense_weight == 0:
             return None
         if (goals := self.env.goals()) is None:
             raise ValueError("reward.dense_weight needs goals, and this environment was made without; set it to 0")
-        frames, found = goals
-        features = _distance_of(self._reward).encode(frames)
-        return features.to(self.env.device), torch.from_numpy(found).to(self.env.device)
+        frames, found = goals[0][:, None], goals[1]
+        lengths = np.ones(len(frames), np.int64)
+        if self._reward.config.mode == "progress":
+            if (golden := self.env.golden) is None:
+                raise ValueError("reward.mode progress needs golden trajectories, and this environment was made for "
+                                 "another mode; make it with the reward's settings")
+            frames, lengths = golden.frames, golden.lengths
+        features = _distance_of(self._reward).encode(frames.reshape(-1, *frames.shape[2:]))
+        arrays = features.view(*frames.shape[:2], -1), torch.from_numpy(found), torch.from_numpy(lengths)
+        device = self.env.device
+        return arrays[0].to(device), arrays[1].to(device), arrays[2].to(device)
 
 
 def capture_graph(device: torch.device, step: Step) -> Step:
@@ -243,8 +266,6 @@ def _checked(reward: RewardModel, policy: ImagePolicy, env: DeviceEnvironment) -
     remedy = "use collect_rollout with an ImaginedEnvironment, where every reward and policy goes"
     if not isinstance(reward, EndogenousReward):
         raise ValueError(f"reward {reward.name} cannot be computed on the device; {remedy}")
-    if reward.config.dense_weight > 0 and reward.config.mode == "progress":
-        raise ValueError(f"reward.mode progress cannot be computed on the device; {remedy}")
     if policy.encoder.sha256 != env.tokenizer_sha256:
         raise ValueError(f"the policy's encoder is not the tokenizer of the world model; {remedy}")
     if reward.config.dense_weight > 0 and _distance_of(reward).identity != env.tokenizer_sha256[:16]:

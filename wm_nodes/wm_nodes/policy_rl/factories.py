@@ -135,13 +135,27 @@ def untrained_policy(config: RunConfig) -> ImagePolicy:
     return ImagePolicy(encoder, spec.state_dim, spec.action_dim, config.policy, seed=config.seed)
 
 
-def make_reward(config: RunConfig, model_dir: Path | None) -> RewardModel:
+def make_reward(config: RunConfig, model_dir: Path | None, *, golden: bool = False) -> RewardModel:
     """Return what a step is worth: the reward of reward.factory, else the endogenous one of the world model, or without
-    a model the environment's own success. Raises as make_endogenous_reward."""
+    a model the environment's own success.
+
+    Args:
+        golden: it is for rollouts that know golden trajectories, see make_collector.
+
+    Raises:
+        ValueError: reward.mode progress without golden trajectories: env/goal holds one frame.
+    """
     if config.reward.factory:
         reward: RewardModel = load_factory(config.reward.factory)(config)
         return reward
-    return RuleReward(config.reward.sparse_weight) if model_dir is None else make_endogenous_reward(config, model_dir)
+    if model_dir is None:
+        return RuleReward(config.reward.sparse_weight)
+    if config.reward.needs_golden and not golden:
+        raise ValueError(
+            "reward.mode progress compares with golden trajectories, and env/goal is one frame; train in one process "
+            "(wm seed-study, wm reproduce roboscape), or choose delta or abs, or set reward.dense_weight to 0"
+        )
+    return make_endogenous_reward(config, model_dir)
 
 
 def make_learner(policy: ImagePolicy, config: RunConfig, ranks: Ranks | None = None) -> Learner:
@@ -180,16 +194,7 @@ def make_reconstruct(model_dir: Path, device: str = CPU) -> Callable[[UInt8Array
 
 
 def make_endogenous_reward(config: RunConfig, model_dir: Path) -> EndogenousReward:
-    """Return reward RS-8 with the distance of the frozen tokenizer's features.
-
-    Raises:
-        ValueError: reward.mode progress, whose golden trajectories no environment publishes: env/goal holds one frame.
-    """
-    if config.reward.mode == "progress" and config.reward.dense_weight:
-        raise ValueError(
-            "reward.mode progress needs golden trajectories, and environments publish the goal frame only; choose "
-            "delta or abs, or set reward.dense_weight to 0 (EndogenousReward itself takes RewardInput.golden)"
-        )
+    """Return reward RS-8 with the distance of the frozen tokenizer's features."""
     encoder = make_encoder(model_dir, config.device)
     return EndogenousReward(config.reward, EncoderDistance(encoder.function, identity=encoder.sha256[:16]))
 
@@ -209,7 +214,7 @@ def make_imagined_environment(
     second = models_of(Path(settings.second_model), config.device) if settings.second_model else None
     noise = settings.picture_noise if training else 0.0
     make = partial(ImaginedEnvironment, seed=seed, picture_noise=noise, second=second)
-    environment = _imagine(make, config, model_dir, starts_file, num_envs)
+    environment = imagined_by(make, config, model_dir, starts_file, num_envs)
     environment.cameras = _cameras(config, environment)
     return environment
 
@@ -250,7 +255,7 @@ def make_device_environment(
 ) -> DeviceEnvironment:
     """Return the world model as a device program for config.task, for DeviceCollector. Raises as
     make_imagined_environment."""
-    return _imagine(DeviceEnvironment, config, model_dir, starts_file, num_envs)
+    return imagined_by(DeviceEnvironment, config, model_dir, starts_file, num_envs)
 
 
 def _cameras(config: RunConfig, environment: ImaginedEpisodes) -> Sequence[CameraModel]:
@@ -259,9 +264,11 @@ def _cameras(config: RunConfig, environment: ImaginedEpisodes) -> Sequence[Camer
     return simulated_cameras(config.simulation, lambda env: environment.current().state[env])
 
 
-def _imagine(
+def imagined_by(
     make: Callable[..., _Imagined], config: RunConfig, model_dir: Path, starts_file: Path, num_envs: int
 ) -> _Imagined:
+    """Return what `make` makes of the arguments of a DeviceEnvironment for config.task. Raises as
+    make_imagined_environment."""
     models = models_of(Path(model_dir), config.device)
     spec = replace(run_spec(config, model_dir), num_envs=num_envs)
     check_model(spec, model_dir, models.spec)

@@ -46,7 +46,7 @@ def main(words: list[str] | None = None) -> None:
         folder = given.pop("model_dir")
         config = load_config(given.pop("preset"), given | settings)
         model = factories.chosen_model(config, folder)
-        policy, reward = factories.make_policy(config, model), factories.make_reward(config, model)
+        policy, reward = factories.make_policy(config, model), factories.make_reward(config, model, golden=True)
         env = factories.make_training_environment(config, model, num_envs=config.ppo.num_envs, seed=config.seed)
     except (ValueError, OSError) as error:
         parser.error(str(error))

@@ -3,6 +3,7 @@
 from typing import Any, TypeVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -79,12 +80,13 @@ class EndogenousReward:
         return crossed
 
     def approach(self, before: _Array, after: _Array) -> _Array:
-        """The unweighted dense reward of the modes delta and abs, of the distances to the goal before and after the
-        step; arrays or tensors."""
+        """The unweighted dense reward of how near the step began and ended: 1 - distance to the goal, or with mode
+        progress progress_along; arrays or tensors."""
         if self._config.mode == "abs":
-            return 1 - after
+            return after
         limit = self._config.dense_clip
-        return ((1 - after) - (1 - before)).clip(-limit, limit)
+        clipped: _Array = (after - before).clip(-limit, limit)
+        return clipped
 
     def _dense(self, step: RewardInput) -> tuple[FloatArray, BoolArray]:
         """Return unweighted dense rewards (N,) and where the goal is missing; rewards are 0 there and where invalid."""
@@ -104,18 +106,25 @@ class EndogenousReward:
         goals = step.goals[rows]
         after = self._distance(step.next_images[rows], goals)
         before = after if self._config.mode == "abs" else self._distance(step.images[rows], goals)
-        return self.approach(before, after)
+        return self.approach(1 - before, 1 - after)
 
     def _progress(self, step: RewardInput, rows: NDArray[np.intp]) -> FloatArray:
         assert step.golden is not None and step.golden_lengths is not None  # checked by _dense and RewardInput
-        golden, lengths = step.golden[rows], step.golden_lengths[rows]
+        golden, lengths = step.golden[rows], torch.from_numpy(step.golden_lengths[rows])
         num_frames = golden.shape[1]
         frames = golden.reshape(-1, *golden.shape[2:])
-        beyond = np.arange(num_frames)[None, :] >= lengths[:, None]
-        progress: list[NDArray[np.float64]] = []
-        for images in (step.images[rows], step.next_images[rows]):
-            distances = self._distance(np.repeat(images, num_frames, axis=0), frames).reshape(-1, num_frames)
-            nearest = np.where(beyond, np.inf, distances).argmin(1)
-            progress.append(nearest / (lengths - 1))
-        limit = self._config.dense_clip
-        return (progress[1] - progress[0]).clip(-limit, limit).astype(np.float32)
+        distances = (
+            torch.from_numpy(self._distance(np.repeat(images[rows], num_frames, axis=0), frames)).view(-1, num_frames)
+            for images in (step.images, step.next_images)
+        )
+        return self.approach(*(progress_along(each, lengths) for each in distances)).numpy()
+
+
+def progress_along(distances: Tensor, lengths: Tensor) -> Tensor:
+    """Index of the nearest golden frame over that of the goal, float32 (...,) in [0, 1].
+
+    Args:
+        distances: to the golden frames (..., K). lengths: how many of them count, int64 (...,).
+    """
+    beyond = torch.arange(distances.shape[-1], device=distances.device) >= lengths.unsqueeze(-1)
+    return distances.masked_fill(beyond, torch.inf).argmin(-1) / (lengths - 1)

@@ -27,7 +27,7 @@ from wm_nodes.world_model.imagined_episodes import (
 )
 from wm_nodes.world_model.parts import in_parallel, parts_of
 from wm_nodes.world_model.precision import copy_in_bfloat16, has_fast_bfloat16
-from wm_nodes.world_model.text import imagine_goals
+from wm_nodes.world_model.text import ImaginedGoals, imagine_goals
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.transformer import RingCache, SpatioTemporalTransformer
 
@@ -49,9 +49,9 @@ def cached_parts(
 def imagine_start_goals(
     models: WorldModels, starts: tuple[UInt8Array, FloatArray], spec: EnvironmentSpec, reward: RewardConfig,
     instructions: Sequence[str] = (),
-) -> tuple[UInt8Array, BoolArray] | None:
-    """Goal frame and found flag of every start: one per (frame, instruction), so computed once; None without a text
-    model. instructions: of every start; none: that of the spec."""
+) -> ImaginedGoals | None:
+    """The golden trajectory of every start: one per (frame, instruction), so computed once; None without a text model.
+    instructions: of every start; none: that of the spec."""
     if models.text is None:
         return None
     images, states = starts
@@ -64,7 +64,9 @@ def imagine_start_goals(
         )
         for i in range(0, len(images), GOAL_BATCH)
     ]
-    return np.concatenate([part.goals for part in parts]), np.concatenate([part.found for part in parts])
+    return ImaginedGoals(
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in ("frames", "lengths", "found"))
+    )
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,10 @@ class DeviceEnvironment(DeviceEpisodes):
             [models.tokenizer.encode(images[i : i + 256]) for i in range(0, len(images), 256)]
         ).clone()
         self._start_tasks = torch.from_numpy(task_indices(states, spec, models.task_index)).to(device)
-        self._goals = imagine_start_goals(models, starts, self.spec, reward, instructions) if with_goals else None
+        found = imagine_start_goals(models, starts, self.spec, reward, instructions) if with_goals else None
+        self._goals = None if found is None else (found.goals, found.found)
+        self.golden = found if reward.mode == "progress" else None
+        """The golden trajectory of every start, on the host; only the progress mode reads it."""
         self.begin_anew()
 
     def begin_anew(self) -> None:
