@@ -44,7 +44,7 @@ OPTIONS = {
     "judge hack": "clips --config --device --judge --judge-model --judge-key-env --rubric --least --limit "
     "--limit-clips --seed --reads --json --pictures",
     "audit": "verify recover sample view agree people replay",
-    **{f"{'reproduce' if name.startswith('roboscape') else 'benchmark'} {name}": "--json" for name in EXPERIMENTS},
+    **{f"{'reproduce' if name == 'roboscape' else 'benchmark'} {name}": "--json" for name in EXPERIMENTS},
     "benchmark tables": "--check --docs",
 }
 

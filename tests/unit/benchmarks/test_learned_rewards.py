@@ -13,6 +13,7 @@ from unit.benchmarks.test_reward_test import CONFIG, EPISODES, recorded
 from benchmarks.environments import learned_rewards, reward_test
 from benchmarks.environments.learned_rewards import EMBEDDING, PROXY, Learned, best_threshold, environment_paid_by
 from benchmarks.environments.reward_test import imagine_all, learned_heads
+from wm_nodes.policy_rl import factories
 from wm_nodes.policy_rl.factories import models_of
 
 
@@ -38,7 +39,8 @@ def test_the_environment_ends_where_the_learned_reward_says_so(
         monkeypatch.setattr(module, "embedding_weights", lambda _: np.random.default_rng(0).normal(0, 0.01, size))
     monkeypatch.setattr(learned_rewards, "episodes_learned_from", lambda *_: seen)
     images, states = seen.real.images[:, 0], seen.real.states[:, 0]
-    monkeypatch.setattr(learned_rewards, "load_starts", lambda *_: (images, states))
+    monkeypatch.setattr(factories, "load_starts", lambda *_: (images, states))
+    monkeypatch.setattr(factories, "load_start_instructions", lambda *_: ())
     config = CONFIG.with_values(ppo=CONFIG.ppo.with_values(num_envs=EPISODES))
     place: Any = SimpleNamespace(config=config, model_dir=folder, start=(write_starts(tmp_path / "starts"), None))
     env = environment_paid_by(reward, place, EPISODES, tmp_path)

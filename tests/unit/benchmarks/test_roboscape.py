@@ -66,6 +66,7 @@ def test_every_training_is_made_once_and_measured_in_and_out_of_domain(
     file = tmp_path / "rows.json"
     words = ["reproduce", "roboscape", "--preset", "smoke", "--model-dir", str(model), "--tasks", "push",
              "--seeds", "0", "--json", str(file), "--work", str(tmp_path / "work"), "--policy.inputs", "latents",
+             "--trainings", SFT, ONE_SCENE, ALL_SCENES, MODEL,
              *(word for name, value in short.items() for word in (f"--{name}", str(value)))]
     assert main(words) == 0
     rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
@@ -75,3 +76,26 @@ def test_every_training_is_made_once_and_measured_in_and_out_of_domain(
     shown = capsys.readouterr().out
     assert "[0.0]" in shown and "RL in the simulator, all training scenes" in shown
     assert main(words) == 0 and json.loads(file.read_text(encoding="utf-8"))["rows"] == rows
+
+
+@pytest.mark.slow
+@pytest.mark.rendering
+def test_figure_3_scores_every_reward_in_every_domain_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = make_model_folder(tmp_path / "model", load_config("smoke", {"task": "push"}))
+    file = tmp_path / "rows.json"
+    words = ["reproduce", "roboscape", "--figure", "3", "--preset", "smoke", "--model-dir", str(model), "--tasks",
+             "push", "--json", str(file), "--work", str(tmp_path / "work"), "--learned-from", "5",
+             "--evaluation.episodes", "5", "--data.num_workers", "1", "--policy.inputs", "latents"]
+    assert main(words) == 0
+    rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
+    assert {row["domain"] for row in rows} == {"train", *OOD}
+    assert [row["reward"] for row in rows[:3]] == ["done signal", "embedding head", "proxy network"]
+    assert "AUROC, empty hand" in capsys.readouterr().out
+    assert main(words) == 0 and json.loads(file.read_text(encoding="utf-8"))["rows"] == rows
+
+
+def test_a_table_and_a_figure_are_two_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reproduce", "roboscape", "--table", "1", "--figure", "2"]) == 2
+    assert "--table and --figure are two runs; give one of them" in capsys.readouterr().err

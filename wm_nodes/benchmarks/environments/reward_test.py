@@ -5,7 +5,7 @@ simulator says which episodes succeed. Shapes: E episodes, T steps, F features.
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,16 +13,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from rich.table import Table
 from torch import Tensor, nn
 
-from benchmarks.environments.experiments import Configured, is_finished
 from benchmarks.environments.policies import spearman
-from benchmarks.experiment import Count, console
-from wm_nodes.config.load import load_config
 from wm_nodes.config.scenes import splits
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT, NEW_CONTEXTS
-from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.seeding import numpy_stream, torch_stream
 from wm_nodes.core.statistics import auroc
 from wm_nodes.core.types import FloatArray, UInt8Array
@@ -69,46 +66,39 @@ class Imagined:
         return won
 
 
-@dataclass(kw_only=True)
-class RewardTest(Configured):
-    """Figure 3 of RoboScape-R with numbers: how well each reward, on imagined steps, tells episodes that succeed in the
-    simulator from those that do not, from an empty hand's alone, and how it grows along a success; with training
-    scenes, unseen objects and unseen combinations."""
+def measure_rewards(config: RunConfig, model_dir: Path, learned_from: int, work: Path) -> Iterator[dict[str, Any]]:
+    """How well each reward, on imagined steps, tells episodes of config.task that succeed in the simulator from those
+    that do not, from an empty hand's alone, and how it grows along a success; for every domain.
 
-    task: str = "pick_place"
-    """Of the episodes; --task."""
-    episodes: Count = 100
-    """Simulator episodes of each domain."""
-    learned_from: Count = 200
-    """Simulator episodes in training scenes that the learned rewards have seen."""
-    work: Path = Path("runs/reward_test")
-    """Folder of the episodes; what is there is kept."""
+    Args:
+        learned_from: simulator episodes in training scenes that the learned rewards have seen.
+        work: folder of the episodes; what is there is kept.
+    """
+    models, episodes = models_of(model_dir, config.device), config.evaluation.episodes
+    heads = learned_heads(episodes_learned_from(config, models, learned_from, work), model_dir, config.seed)
+    for domain in splits():
+        found = imagined_episodes(config, models, domain, HELDOUT.take(episodes), episodes, work)
+        goals = goals_of(models, found.real, config)
+        scored = paid(found, goals, model_dir, config) | {name: head(found) for name, head in heads.items()}
+        for name, values in scored.items():
+            yield {"task": config.task, "domain": domain, "reward": name, **judge_reward(values, found, config.seed)}
 
-    def run(self) -> None:
-        config = load_config(self.preset, {"task": self.task, **self.settings})
-        model_dir, rows = self.model_dir or shipped_model(self.task), self.read()
-        models = models_of(model_dir, config.device)
-        wanted = {"config": config.model_dump(mode="json"), "world_model_sha256": models.sha256,
-                  "episodes": self.episodes, "learned_from": self.learned_from}
-        if not is_finished(rows, wanted):
-            seen = episodes_learned_from(config, models, self.learned_from, self.work)
-            heads = learned_heads(seen, model_dir, config.seed)
-            for domain in splits():
-                first = HELDOUT.take(self.episodes)
-                found = imagined_episodes(config, models, domain, first, self.episodes, self.work)
-                goals = goals_of(models, found.real, config)
-                scored = paid(found, goals, model_dir, config) | {name: head(found) for name, head in heads.items()}
-                for name, values in scored.items():
-                    told = judge_reward(values, found, config.seed)
-                    rows.append({**wanted, "task": self.task, "domain": domain, "reward": name, **told})
-            self.write({"rows": rows}, device=config.device)
-        columns = ("reward", "scenes", "episodes", "succeed", "AUROC (95 %)", "AUROC, empty hand", "rank correlation")
-        console.print(make_table(f"{self.task}: what a reward tells of real success", columns, [
-            (row["reward"], row["domain"], str(row["episodes_scored"]), str(row["successes"]),
-             "{:.2f} ({:.2f} to {:.2f})".format(*row["auroc"]), f"{row['auroc_empty_hand']:.2f}",
-             f"{row['rank_correlation']:+.2f}")
-            for row in rows if is_finished([row], wanted)
-        ]))
+
+def rewards_table(rows: Iterable[dict[str, Any]]) -> Table:
+    """Of the rows of measure_rewards."""
+    columns = ("task", "reward", "scenes", "episodes", "succeed", "AUROC", "95 %", "AUROC, empty hand",
+               "rank correlation")
+    return make_table("what a reward tells of real success", columns, [
+        (row["task"], row["reward"], row["domain"], str(row["episodes_scored"]), str(row["successes"]),
+         shown(row["auroc"][0]), " to ".join(map(shown, row["auroc"][1:])), shown(row["auroc_empty_hand"]),
+         shown(row["rank_correlation"], "+.2f"))
+        for row in rows
+    ])
+
+
+def shown(value: float | None, form: str = ".2f") -> str:
+    """A number, or what is written where there is none: no episode, or none of one kind."""
+    return "-" if value is None or not np.isfinite(value) else format(value, form)
 
 
 def episodes_learned_from(config: RunConfig, models: WorldModels, count: int, work: Path) -> Imagined:
@@ -241,7 +231,7 @@ def largest(values: NDArray[np.float64], found: Imagined) -> NDArray[np.float64]
 
 
 def judge_reward(values: NDArray[np.float64], found: Imagined, seed: int) -> dict[str, Any]:
-    """What a reward, given by its sum up to each step (E, T), says of real success: see RewardTest."""
+    """What a reward, given by its sum up to each step (E, T), says of real success: see measure_rewards."""
     won, scores = found.won, values[:, -1]
     empty = np.array([behaviour == EMPTY_HAND for behaviour in found.real.behaviours]) & ~won
     draws = numpy_stream(seed, "reward_test", len(won)).integers(len(won), size=(DRAWS, len(won)))

@@ -1,10 +1,10 @@
-"""Table 1 of RoboScape-R at the size of this repository: the same clones, trained by RL in the simulator and in the
-world model, and measured in and out of domain.
+"""Table 1, Figures 2 and 3 of RoboScape-R at the size of this repository: the same clones, trained by RL in the
+simulator and in the world model, by several rewards, and measured in and out of domain.
 
 A clone has seen demonstrations of one scene alone. IND is that scene, OOD the mean of ood_object and ood_combo.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -13,27 +13,34 @@ from typing import Any, Literal, get_args
 from benchmarks.environments.experiments import Configured, is_finished
 from benchmarks.environments.learned_rewards import EMBEDDING, PROXY, Learned, environment_paid_by
 from benchmarks.environments.policies import SIMULATOR, WORLD_MODEL, Workplace, rate_of, train_on
-from benchmarks.experiment import console
+from benchmarks.environments.reward_test import measure_rewards, rewards_table
+from benchmarks.experiment import Count, console
 from benchmarks.video_rl.comparison import paired_interval
 from wm_nodes.apps.seed_study import mean_gain
 from wm_nodes.config.load import load_config
 from wm_nodes.config.scenes import draw, splits
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.model_folder import files_sha256
 from wm_nodes.core.progress import tqdm
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.world_model import ImaginedEpisodes
+from wm_nodes.world_model.folder import read_world_manifest
 
 TASKS = ("pick_place", "push", "pull", "move_to_aim")
-Training = Literal["sft", "one_scene", "all_scenes", "world_model", "embedding", "proxy"]
-SFT, ONE_SCENE, ALL_SCENES, MODEL, *_ = get_args(Training)
+Training = Literal["sft", "one_scene", "all_scenes", "world_model", "goal", "progress", "embedding", "proxy"]
+SFT, ONE_SCENE, ALL_SCENES, MODEL, GOAL, PROGRESS, *_ = get_args(Training)
 LABELS = {
     SFT: "SFT", ONE_SCENE: "RL in the simulator, its scene", ALL_SCENES: "RL in the simulator, all training scenes",
-    MODEL: "RL in the world model", "embedding": "the same, an embedding head pays",
+    MODEL: "RL in the world model", GOAL: "the same, goal distance pays too",
+    PROGRESS: "the same, golden progress pays too", "embedding": "the same, an embedding head pays",
     "proxy": "the same, a proxy network pays",
 }
+DENSE = {GOAL: "delta", PROGRESS: "progress"}
+"""The dense reward that pays beside the done signal, a value of reward.mode."""
 LEARNED: dict[str, Learned] = {"embedding": EMBEDDING, "proxy": PROXY}
-LEARNED_FROM = 200
-"""Simulator episodes in training scenes that a learned reward has seen."""
+IN_MODEL = {MODEL, *DENSE, *LEARNED}
+TABLE_1: tuple[Training, ...] = ("sft", "one_scene", "all_scenes", "world_model", "goal")
+FIGURE_2: tuple[Training, ...] = ("world_model", "goal", "progress", "embedding", "proxy")
 OOD, TRAIN = ("ood_object", "ood_combo"), "train"
 PAPER = {
     (SFT, "IND"): (12.0, 84.5, 57.7, 35.8), (SFT, "OOD"): (3.5, 13.3, 10.2, 10.6),
@@ -41,6 +48,7 @@ PAPER = {
     (MODEL, "IND"): (86.7, 98.7, 65.2, 88.1), (MODEL, "OOD"): (74.2, 87.3, 51.3, 72.0),
 }
 """The paper's cells of its MLP policy, %, in the order of TASKS."""
+PAPER |= {(GOAL, domain): PAPER[MODEL, domain] for domain in ("IND", "OOD")}
 
 
 def scene_of_seed(seed: int) -> str:
@@ -51,48 +59,82 @@ def scene_of_seed(seed: int) -> str:
 
 @dataclass(kw_only=True)
 class RoboScape(Configured):
-    """Table 1 of RoboScape-R: success of a policy cloned in one scene, after RL in the simulator on that scene, on all
-    training scenes, and in the world model; measured in its scene (IND), with unseen objects and in unseen combinations
-    (OOD). What --json holds is not trained again."""
+    """RoboScape-R at this size. Table 1: success of a policy cloned in one scene, after RL in the simulator on that
+    scene, on all training scenes, and in the world model; measured in its scene (IND), with unseen objects and in
+    unseen combinations (OOD). Figure 2: the same of RL in the world model by several rewards. Figure 3: how well each
+    reward tells, on imagined steps, what succeeds in the simulator. What --json holds is not made again."""
 
     preset: str = "fair_start"
     """Of the settings: a name, or a .yaml."""
+    table: Literal["1"] | None = None
+    """The trainings of this table, the default."""
+    figure: Literal["2", "3"] | None = None
+    """The trainings of Figure 2, or Figure 3, which trains nothing but the learned rewards."""
     tasks: tuple[str, ...] = TASKS
     """Columns."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Each has demonstrations and a scene of its own."""
-    trainings: tuple[Training, ...] = (SFT, ONE_SCENE, ALL_SCENES, MODEL)
-    """Rows: the clone, and RL from it in the simulator on its scene, there on all training scenes, or in the model; or
-    there paid by a reward that was learned from success, as iVideoGPT's head or DiWA's network (Figure 2)."""
+    trainings: tuple[Training, ...] = ()
+    """Rows instead: the clone, and RL from it in the simulator on its scene, there on all training scenes, or in the
+    model, where the done signal pays, or that and the distance to the imagined goal or progress along the golden
+    trajectory, or a reward that was learned from success, as iVideoGPT's head or DiWA's network."""
+    learned_from: Count = 200
+    """Simulator episodes in training scenes that a learned reward has seen."""
     work: Path = Path("runs/roboscape")
-    """Folder of first frames and policies; what is there is kept."""
+    """Folder of episodes, first frames and policies; what is there is kept."""
 
     def run(self) -> None:
-        rows, shown = self.read(), list[dict[str, Any]]()
-        cells = [(task, seed, name) for task in self.tasks for seed in self.seeds for name in self.trainings]
+        if self.table and self.figure:
+            raise ValueError("--table and --figure are two runs; give one of them")
+        if self.figure == "3":
+            self._test_rewards()
+        else:
+            self._train(self.trainings or (FIGURE_2 if self.figure else TABLE_1))
+
+    def _train(self, trainings: Sequence[str]) -> None:
+        shown = list[dict[str, Any]]()
+        cells = [(task, seed, name) for task in self.tasks for seed in self.seeds for name in trainings]
         for task, seed, training in tqdm(cells, desc="cells", unit="cell"):
             own = scene_of_seed(seed)
-            workplace = self.workplace(task, seed, own)
-            wanted = {**workplace.identity(SIMULATOR, (own, *OOD)), "model": training, "task": task, "seed": seed}
-            if not is_finished(rows, wanted):
-                rows.append({**wanted, **_cell(workplace, training, own, self.work)})
-                self.write({"rows": rows}, device=workplace.config.device)
-            shown += [row for row in rows if is_finished([row], wanted)]
-        self._show(shown)
+            place = self.workplace(task, seed, own, training)
+            wanted = {**place.identity(SIMULATOR, (own, *OOD)), "model": training, "task": task, "seed": seed}
+            shown += self._once(wanted, _cell(place, training, own, self.learned_from, self.work))
+        self._show(shown, trainings)
 
-    def workplace(self, task: str, seed: int, own: str) -> Workplace:
-        given = {"sft.scenes": own, **self.settings, "task": task, "seed": seed}
-        config = load_config(self.preset, given)
+    def _once(self, wanted: dict[str, Any], make: Iterator[dict[str, Any]]) -> list[dict[str, Any]]:
+        """The rows that --json holds of these values, else those made now; processes may share the file."""
+        if found := [row for row in self.read() if is_finished([row], wanted)]:
+            return found
+        made = [{**wanted, **row} for row in make]
+        self.write({"rows": [*self.read(), *made]}, device=wanted["config"]["device"])
+        return made
+
+    def workplace(self, task: str, seed: int, own: str, training: str) -> Workplace:
+        dense = {"reward.dense_weight": 1.0, "reward.mode": DENSE[training]} if training in DENSE else {}
+        config = load_config(self.preset, {"sft.scenes": own, **dense, **self.settings, "task": task, "seed": seed})
         return Workplace(config, self.model_dir or shipped_model(task), self.work.absolute() / f"{task}_{seed}")
 
-    def _show(self, rows: Sequence[dict[str, Any]]) -> None:
+    def _test_rewards(self) -> None:
+        shown = list[dict[str, Any]]()
+        for task in tqdm(self.tasks, desc="tasks", unit="task"):
+            config = load_config(self.preset, {**self.settings, "task": task})
+            folder = self.model_dir or shipped_model(task)
+            wanted = {
+                "config": config.model_dump(mode="json"), "learned_from": self.learned_from,
+                "world_model_sha256": files_sha256(read_world_manifest(folder)),
+            }
+            shown += self._once(wanted, measure_rewards(config, folder, self.learned_from, self.work))
+        console.print(rewards_table(shown))
+
+    def _show(self, rows: Sequence[dict[str, Any]], trainings: Sequence[str]) -> None:
         columns = [(task, domain) for task in self.tasks for domain in ("IND", "OOD")]
         lines = []
-        for training in self.trainings:
+        for training in trainings:
             found = [[row for row in rows if (row["model"], row["task"]) == (training, task)] for task, _ in columns]
             cells = (cell(of, domain) for of, (_, domain) in zip(found, columns, strict=True))
             lines.append((LABELS[training], *cells))
-            lines.append(("  paper", *(_paper(training, task, domain) for task, domain in columns)))
+            if any(paper := [_paper(training, task, domain) for task, domain in columns]):
+                lines.append(("  paper", *paper))
         names = [f"{task} {domain}" for task, domain in columns]
         console.print(make_table("success, %; in brackets: the model is not accepted", ("", *names), lines))
         for base in (ONE_SCENE, ALL_SCENES):
@@ -100,16 +142,18 @@ class RoboScape(Configured):
                 console.print(f"OOD, {LABELS[MODEL]} less {LABELS[base]}, mean over tasks: {text} points")
 
 
-def _cell(workplace: Workplace, training: str, own: str, work: Path) -> dict[str, Any]:
-    """Train one policy and measure it in every column."""
+def _cell(
+    workplace: Workplace, training: str, own: str, learned_from: int, work: Path
+) -> Iterator[dict[str, Any]]:
+    """Train one policy and measure it in every column; one row."""
     config, policy, report = workplace.config, workplace.policy(), None
     imagined: ImaginedEpisodes | None = None
-    if training == MODEL or training in LEARNED:
+    if training in IN_MODEL:
         imagined = workplace.environment(WORLD_MODEL)
         before = workplace.imagined(policy, imagined)
         report = workplace.acceptance(WORLD_MODEL, policy, before, workplace.real(policy, TRAIN))
     if training in LEARNED:
-        imagined = environment_paid_by(LEARNED[training], workplace, LEARNED_FROM, work)
+        imagined = environment_paid_by(LEARNED[training], workplace, learned_from, work)
     course = list[float]()
     if training != SFT:
         words = f"{config.task}, seed {config.seed}, {LABELS[training]}"
@@ -118,7 +162,7 @@ def _cell(workplace: Workplace, training: str, own: str, work: Path) -> dict[str
                 course.append(success_rate)
                 bar.update()
     found = {name: workplace.real(policy, name) for name in (own, *OOD)}
-    return {
+    yield {
         "scene": own, "course": course,
         **({} if report is None else {"accepted": report.passed, "acceptance": report.to_dict()}),
         "success": {
@@ -147,13 +191,13 @@ def cell(rows: Sequence[dict[str, Any]], domain: str) -> str:
     return text if all(row.get("accepted", True) for row in rows) else f"[{text}]"
 
 
-def gain(rows: Iterable[dict[str, Any]], base: str) -> str:
+def gain(rows: Iterable[dict[str, Any]], base: str, training: str = MODEL) -> str:
     """The paper's headline by its formula, mean_gain, over the tasks and seeds that both have; "" without any."""
     rates = {(row["seed"], row["model"], row["task"]): success_of(row, "OOD") for row in rows}
-    both = [(seed, task) for seed, name, task in rates if name == MODEL and (seed, base, task) in rates]
+    both = [(seed, task) for seed, name, task in rates if name == training and (seed, base, task) in rates]
     of_seeds = [
         mean_gain({(str(seed), name, task): rates[seed, name, task] for one, task in both if one == seed
-                   for name in (MODEL, base)}, MODEL, base)
+                   for name in (training, base)}, training, base)
         for seed in sorted({seed for seed, _ in both})
     ]
     if not of_seeds:

@@ -6,11 +6,15 @@ from statistics import fmean
 
 from benchmarks.environments.roboscape import (
     ALL_SCENES,
+    FIGURE_2,
+    GOAL,
     LABELS,
     MODEL,
     ONE_SCENE,
     PAPER,
+    PROGRESS,
     SFT,
+    TABLE_1,
     TASKS,
     gain,
     success_of,
@@ -19,64 +23,58 @@ from benchmarks.tables.table import Rows, Run, interval, read
 from benchmarks.video_rl.comparison import paired_interval
 from wm_nodes.config.scenes import splits
 
-REWARDS, TABLE_1 = "roboscape_rewards.json", "roboscape_table1.json"
+REWARDS, TRAINED = "roboscape_rewards.json", "roboscape_table1.json"
 DOMAINS = "IND", "OOD"
 POSITIONS = "positions"
+OURS = "reach_object"
+"""A task that the paper does not have."""
+PAYS = {
+    MODEL: "done signal", GOAL: "goal distance and done signal", PROGRESS: "golden progress and done signal",
+    "embedding": "embedding head (iVideoGPT)", "proxy": "proxy network (DiWA)",
+}
 
 
-def trained(
-    rows: Sequence[Run], training: str, task: str, inputs: str = POSITIONS, dense: float = 0.0, mode: str = "delta"
-) -> list[Run]:
-    """Those of the rows of Table 1, by seed. inputs: policy.inputs; dense, mode: of the reward."""
-    found = [
-        row for row in rows
-        if (row["model"], row["task"], row["config"]["policy"]["inputs"]) == (training, task, inputs)
-        and (row["config"]["reward"]["dense_weight"], row["config"]["reward"].get("mode", "delta")) == (dense, mode)
-    ]
+def trained(rows: Sequence[Run], training: str, task: str, inputs: str = POSITIONS) -> list[Run]:
+    """Those of the rows of Table 1, by seed. inputs: policy.inputs."""
+    wanted = training, task, inputs
+    found = [row for row in rows if (row["model"], row["task"], row["config"]["policy"]["inputs"]) == wanted]
     return sorted(found, key=lambda row: int(row["seed"]))
 
 
 def table_1() -> Rows:
-    found = read(TABLE_1)["rows"]
-    for task, inputs in product(TASKS, (POSITIONS, "latents")):
-        for training, dense in ((SFT, 0), (ONE_SCENE, 0), (ALL_SCENES, 0), (MODEL, 0), (MODEL, 1)):
-            of = trained(found, training, task, inputs, dense)
-            if of:
-                papers = (PAPER.get((training, domain)) for domain in DOMAINS)
-                yield (
-                    task, f"{inputs}, {of[0]['config']['sft']['num_demonstrations']}",
-                    LABELS[training] + ", done signal and goal" * dense,
-                    *(f"{fmean(success_of(row, domain) for row in of):.1f}" for domain in DOMAINS),
-                    *(", ".join(f"{success_of(row, domain):.1f}" for row in of) for domain in DOMAINS),
-                    ", ".join("yes" if row["accepted"] else "no" for row in of) if training == MODEL else "",
-                    *("" if paper is None else paper[TASKS.index(task)] for paper in papers),
-                )
+    found = read(TRAINED)["rows"]
+    for task, inputs, training in product((*TASKS, OURS), (POSITIONS, "latents"), TABLE_1):
+        if of := trained(found, training, task, inputs):
+            papers = (PAPER.get((training, domain)) if task in TASKS else None for domain in DOMAINS)
+            yield (
+                task, f"{inputs}, {of[0]['config']['sft']['num_demonstrations']}", LABELS[training],
+                *(f"{fmean(success_of(row, domain) for row in of):.1f}" for domain in DOMAINS),
+                *(", ".join(f"{success_of(row, domain):.1f}" for row in of) for domain in DOMAINS),
+                ", ".join("yes" if row["accepted"] else "no" for row in of) if training in (MODEL, GOAL) else "",
+                *("" if paper is None else paper[TASKS.index(task)] for paper in papers),
+            )
 
 
 def table_1_gains() -> Rows:
-    found = read(TABLE_1)["rows"]
-    for dense, inputs, base, task in product((0, 1), (POSITIONS, "latents"), (SFT, ONE_SCENE, ALL_SCENES), TASKS):
-        if text := gain([*trained(found, MODEL, task, inputs, dense), *trained(found, base, task, inputs)], base):
-            yield task, inputs, "done signal and goal" if dense else "done signal", LABELS[base], text
+    found = read(TRAINED)["rows"]
+    for training, inputs, base, task in product(
+        (MODEL, GOAL), (POSITIONS, "latents"), (SFT, ONE_SCENE, ALL_SCENES), (*TASKS, OURS)
+    ):
+        if text := gain([*trained(found, training, task, inputs), *trained(found, base, task, inputs)], base, training):
+            yield task, inputs, PAYS[training], LABELS[base], text
 
 
 def figure_2() -> Rows:
-    found = read(TABLE_1)["rows"]
-    done = trained(found, MODEL, "push")
-    base = {row["seed"]: success_of(row, "OOD") for row in done}
-    arms = {
-        "done signal": done, "goal distance and done signal": trained(found, MODEL, "push", dense=1.0),
-        "embedding head (iVideoGPT)": trained(found, "embedding", "push"),
-        "proxy network (DiWA)": trained(found, "proxy", "push"),
-    }
-    for name, of in arms.items():
-        if of:
+    found = read(TRAINED)["rows"]
+    base = {row["seed"]: success_of(row, "OOD") for row in trained(found, MODEL, "push")}
+    for training in FIGURE_2:
+        if of := trained(found, training, "push"):
             differences = [success_of(row, "OOD") - base[row["seed"]] for row in of]
-            apart = "" if name == "done signal" else f"{fmean(differences):+.1f}"
+            apart = "" if training == MODEL else f"{fmean(differences):+.1f}"
             if apart and len(of) > 1:
                 over = paired_interval(differences)
                 apart = interval(over.mean, over.low, over.high, 1)
-            yield name, *(by_seed([success_of(row, domain) for row in of]) for domain in DOMAINS), apart
+            yield PAYS[training], *(by_seed([success_of(row, domain) for row in of]) for domain in DOMAINS), apart
 
 
 def by_seed(rates: Sequence[float]) -> str:
