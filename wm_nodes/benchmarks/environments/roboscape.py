@@ -5,7 +5,7 @@ A clone has seen demonstrations of one scene alone. IND is that scene, OOD the m
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal, get_args
@@ -22,23 +22,26 @@ from wm_nodes.config.scenes import draw, splits
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.model_folder import files_sha256
 from wm_nodes.core.progress import tqdm
+from wm_nodes.policy_rl.model_refresh import RefreshDecision, refresh_round, round_folder
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.world_model import ImaginedEpisodes
 from wm_nodes.world_model.folder import read_world_manifest
 
 TASKS = ("pick_place", "push", "pull", "move_to_aim")
-Training = Literal["sft", "one_scene", "all_scenes", "world_model", "goal", "progress", "embedding", "proxy"]
-SFT, ONE_SCENE, ALL_SCENES, MODEL, GOAL, PROGRESS, *_ = get_args(Training)
+Training = Literal[
+    "sft", "one_scene", "all_scenes", "world_model", "refreshed", "goal", "progress", "embedding", "proxy"
+]
+SFT, ONE_SCENE, ALL_SCENES, MODEL, REFRESHED, GOAL, PROGRESS, *_ = get_args(Training)
 LABELS = {
     SFT: "SFT", ONE_SCENE: "RL in the simulator, its scene", ALL_SCENES: "RL in the simulator, all training scenes",
-    MODEL: "RL in the world model", GOAL: "the same, goal distance pays too",
-    PROGRESS: "the same, golden progress pays too", "embedding": "the same, an embedding head pays",
+    MODEL: "RL in the world model", REFRESHED: "the same, refreshed by the clone's episodes",
+    GOAL: "the same, goal distance pays too", PROGRESS: "the same, golden progress pays too", "embedding": "the same, an embedding head pays",
     "proxy": "the same, a proxy network pays",
 }
 DENSE = {GOAL: "delta", PROGRESS: "progress"}
 """The dense reward that pays beside the done signal, a value of reward.mode."""
 LEARNED: dict[str, Learned] = {"embedding": EMBEDDING, "proxy": PROXY}
-IN_MODEL = {MODEL, *DENSE, *LEARNED}
+IN_MODEL = {MODEL, REFRESHED, *DENSE, *LEARNED}
 TABLE_1: tuple[Training, ...] = ("sft", "one_scene", "all_scenes", "world_model", "goal")
 FIGURE_2: tuple[Training, ...] = ("world_model", "goal", "progress", "embedding", "proxy")
 OOD, TRAIN = ("ood_object", "ood_combo"), "train"
@@ -76,8 +79,9 @@ class RoboScape(Configured):
     """Each has demonstrations and a scene of its own."""
     trainings: tuple[Training, ...] = ()
     """Rows instead: the clone, and RL from it in the simulator on its scene, there on all training scenes, or in the
-    model, where the done signal pays, or that and the distance to the imagined goal or progress along the golden
-    trajectory, or a reward that was learned from success, as iVideoGPT's head or DiWA's network."""
+    model, as it is or refreshed by simulator episodes of the clone. There the done signal pays; that and the distance to
+    the imagined goal or progress along the golden trajectory; or a reward that was learned from success, as iVideoGPT's
+    head or DiWA's network."""
     learned_from: Count = 200
     """Simulator episodes in training scenes that a learned reward has seen."""
     work: Path = Path("runs/roboscape")
@@ -146,8 +150,10 @@ def _cell(
     workplace: Workplace, training: str, own: str, learned_from: int, work: Path
 ) -> Iterator[dict[str, Any]]:
     """Train one policy and measure it in every column; one row."""
-    config, policy, report = workplace.config, workplace.policy(), None
+    config, policy, report, refresh = workplace.config, workplace.policy(), None, None
     imagined: ImaginedEpisodes | None = None
+    if training == REFRESHED:
+        workplace, refresh = _refreshed(workplace)
     if training in IN_MODEL:
         imagined = workplace.environment(WORLD_MODEL)
         before = workplace.imagined(policy, imagined)
@@ -165,11 +171,20 @@ def _cell(
     yield {
         "scene": own, "course": course,
         **({} if report is None else {"accepted": report.passed, "acceptance": report.to_dict()}),
+        **({} if refresh is None else {"refresh": refresh.to_dict()}),
         "success": {
             name: {**rate_of(result), "episodes_won": result.success.astype(int).tolist()}
             for name, result in found.items()
         },
     }
+
+
+def _refreshed(workplace: Workplace) -> tuple[Workplace, RefreshDecision]:
+    """The same with a model that went on learning from the clone's episodes in the simulator (model_refresh), and how
+    it compares with the old one; it is taken in either case."""
+    config, folder, (starts, weights) = workplace.config, workplace.folder, workplace.start
+    decision = refresh_round(config, workplace.model_dir, weights, starts, folder, 1)
+    return replace(workplace, model_dir=round_folder(folder, 1) / "model"), decision
 
 
 def success_of(row: dict[str, Any], domain: str) -> float:
