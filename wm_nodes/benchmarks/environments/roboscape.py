@@ -35,8 +35,8 @@ SFT, ONE_SCENE, ALL_SCENES, MODEL, REFRESHED, GOAL, PROGRESS, *_ = get_args(Trai
 LABELS = {
     SFT: "SFT", ONE_SCENE: "RL in the simulator, its scene", ALL_SCENES: "RL in the simulator, all training scenes",
     MODEL: "RL in the world model", REFRESHED: "the same, refreshed by the clone's episodes",
-    GOAL: "the same, goal distance pays too", PROGRESS: "the same, golden progress pays too", "embedding": "the same, an embedding head pays",
-    "proxy": "the same, a proxy network pays",
+    GOAL: "the same, goal distance pays too", PROGRESS: "the same, golden progress pays too",
+    "embedding": "the same, an embedding head pays", "proxy": "the same, a proxy network pays",
 }
 DENSE = {GOAL: "delta", PROGRESS: "progress"}
 """The dense reward that pays beside the done signal, a value of reward.mode."""
@@ -79,9 +79,9 @@ class RoboScape(Configured):
     """Each has demonstrations and a scene of its own."""
     trainings: tuple[Training, ...] = ()
     """Rows instead: the clone, and RL from it in the simulator on its scene, there on all training scenes, or in the
-    model, as it is or refreshed by simulator episodes of the clone. There the done signal pays; that and the distance to
-    the imagined goal or progress along the golden trajectory; or a reward that was learned from success, as iVideoGPT's
-    head or DiWA's network."""
+    model, as it is or refreshed by simulator episodes of the clone. There the done signal pays; that and the distance
+    to the imagined goal or progress along the golden trajectory; or a reward that was learned from success, as
+    iVideoGPT's head or DiWA's network."""
     learned_from: Count = 200
     """Simulator episodes in training scenes that a learned reward has seen."""
     work: Path = Path("runs/roboscape")
