@@ -1,6 +1,7 @@
 """Clips, codec, scores, settings and folder of the video model."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,8 @@ from wm_nodes.video_model.clips import Clips, checked, cut_clips, load_clips
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.conditions import hashed_words
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
-from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, all_scores, mix_rewards, score_clips, score_pictures
+from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, mix_rewards, score_clips, score_pictures
+from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
 from wm_nodes.world_model.positions import position_names
 from wm_nodes.world_model.tokenizer import NUM_POSITIONS
 
@@ -177,14 +179,20 @@ def test_without_simulator_state_pictures_are_scored_and_all_else_is_unknown(tmp
         bag.write(make_episode(spec, 0, 4))
     clips = load_clips([tmp_path / "bag"], 2)
     assert clips.ground_truth.shape == (1, 3, len(GROUND_TRUTH_NAMES)) and np.isnan(clips.ground_truth).all()
-    blind, codec, weights = object(), PatchCodec(4, 6), {"closeness": 0.5, "ssim": 0.5, "tracking": 0.0}
+    codec, weights = PatchCodec(4, 6), {"closeness": 0.5, "ssim": 0.5, "tracking": 0.0}
     codec.fit(clips.frames.flatten(0, 1))
-    found = all_scores(clips.frames, clips, blind, codec, 1, weights)  # type: ignore[arg-type]
+    folder: Any = SimpleNamespace(codec=codec, clip={"num_conditioning": 1})
+
+    def scores(**rewards: float) -> dict[str, Tensor]:
+        blind: Any = object()
+        source = RecordedContexts(folder, clips, load_video_config("base", {"rewards": rewards}), blind)
+        return source.scores(GroupRequest((0,), 1, 0, 0), clips.frames)
+
+    found = scores(**weights)
     known = {"scenery", "psnr_db", *PICTURE_SCORES}
     assert {name for name, values in found.items() if torch.isfinite(values).all()} == known
     assert mix_rewards(found, weights).tolist() == [1.0]
-    plain = all_scores(clips.frames, clips, blind, codec, 1, {"tracking": 1.0})  # type: ignore[arg-type]
-    assert found.keys() - plain.keys() == set(PICTURE_SCORES)
+    assert found.keys() - scores(tracking=1.0).keys() == set(PICTURE_SCORES)
 
 
 def written(folder: Path, *lengths: int, **changes: Any) -> Path:

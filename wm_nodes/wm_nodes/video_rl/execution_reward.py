@@ -40,13 +40,6 @@ DECIMALS = 6
 """Of the correction: libraries differ in the last bits of a least-squares solution."""
 
 
-def load_execution_reward(
-    config: VideoRlConfig, folder: VideoFolder, recordings: Clips, probe: PositionProbe
-) -> "ExecutionReward | None":
-    """Return make_execution_reward(), or None where `execution` has no weight. Raises as that."""
-    return make_execution_reward(config, folder, recordings, probe) if config.rewards.get(EXECUTION) else None
-
-
 def make_execution_reward(
     config: VideoRlConfig, folder: VideoFolder, recordings: Clips, probe: PositionProbe
 ) -> "ExecutionReward":
