@@ -193,8 +193,6 @@ def test_clips_that_do_not_begin_with_a_recorded_frame_and_its_state_are_refused
     astray[3, 0, 1] += 0.05
     with pytest.raises(ValueError, match=r"recording 3 begins 5.0 cm from where its first state has the tool"):
         made(replace(clips, states=astray))
-    with pytest.raises(ValueError, match="from bags"):
-        load(replace(clips, spec=None))
     with pytest.raises(ConfigError, match=r"set rewards.execution 0, or groups.history 0"):
         load_video_config("closed_loop", {"rewards": {"execution": 1.0}})
 
