@@ -138,12 +138,12 @@ class RecordedContexts:
             return start.repeat_interleave(request.group_size)
         lengths, contexts = self._lengths(), torch.arange(len(request.contexts))
 
-        def noise(clip: int, shape: tuple[int, ...]) -> Tensor:
+        def seeds(clip: int) -> Tensor:
             of = torch.full_like(contexts, clip)
-            return initial_noise(shape, _seeds(self.config.seed, "history_noise", request.iteration, contexts, of))
+            return _seeds(self.config.seed, "history_noise", request.iteration, contexts, of)
 
         frames, settings = self._made(request.history), _ode(self.config, self.config.rollout.num_steps)
-        videos = continue_videos(self.folder.network, start, lengths, frames, noise, settings)
+        videos = continue_videos(self.folder.network, start, lengths, frames, seeds, settings)
         return clip_condition(videos, start, lengths).repeat_interleave(request.group_size)
 
     def place(self, request: GroupRequest) -> tuple[int, int]:
@@ -197,13 +197,12 @@ def sample_by_ode(folder: VideoFolder, contexts: Clips, config: VideoRlConfig, n
     """
     rows, condition = torch.arange(len(contexts)), _condition(folder, contexts, config)
 
-    def noise(clip: int, shape: tuple[int, ...]) -> Tensor:
-        seeds = _seeds(config.seed, "clip_evaluation", clip, rows, torch.zeros_like(rows))
-        return initial_noise(shape, seeds).to(folder.device)
+    def seeds(clip: int) -> Tensor:
+        return _seeds(config.seed, "clip_evaluation", clip, rows, torch.zeros_like(rows))
 
     K, count = condition.num_conditioning, contexts.frames.shape[1]
     lengths = folder.lengths or ClipLengths(K, count - K)
-    videos = continue_videos(folder.network, condition, lengths, count, noise, _ode(config, num_steps))
+    videos = continue_videos(folder.network, condition, lengths, count, seeds, _ode(config, num_steps))
     return folder.codec.decode(videos)
 
 
