@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.distributed as dist
+from recording_samples import make_spec
 from torch import Tensor, nn
 from torch.distributions import Normal
 
@@ -64,8 +65,8 @@ def toy_clips(
 ) -> Clips:
     """Recordings of PushCube whose seeds and states say nothing."""
     E, F = frames.shape[:2]
-    states = np.zeros((E, F, 3), np.float32)
-    return Clips(frames, actions, truth, instructions or ("push",) * E, "push_cube", tuple(range(E)), states)
+    states, spec = np.zeros((E, F, 3), np.float32), make_spec()
+    return Clips(frames, actions, truth, instructions or ("push",) * E, "push_cube", tuple(range(E)), states, spec)
 
 
 class Analytic(nn.Module):

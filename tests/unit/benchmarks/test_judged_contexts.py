@@ -96,7 +96,7 @@ def test_recorded_actions_are_not_what_a_clip_of_hidden_actions_should_show(give
     still = contexts.frames[:2, :1].expand_as(contexts.frames[:2]).clone()
     moved = Clips(
         contexts.frames[:2], torch.ones_like(contexts.actions[:2]), contexts.ground_truth[:2],
-        contexts.instructions[:2], contexts.task, contexts.seeds[:2], contexts.states[:2],
+        contexts.instructions[:2], contexts.task, contexts.seeds[:2], contexts.states[:2], contexts.spec,
     )
 
     def jobs(**changes: Any) -> list[ClipJob]:

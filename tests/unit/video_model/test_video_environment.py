@@ -82,7 +82,7 @@ def assert_same(first: StepResult, second: StepResult, rows: slice = slice(None)
     np.testing.assert_array_equal(first.success_probability[rows], second.success_probability[others])
 
 
-def test_an_episode_is_the_model_going_on_from_its_own_last_frames() -> None:
+def test_an_episode_is_the_model_going_on_from_its_own_last_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same frames as continue_videos gives clip after clip, with the same noise."""
     folder, seed, count = make_folder(), 7, 6
     env = make(folder, num_envs=1, exact=True)
@@ -90,16 +90,20 @@ def test_an_episode_is_the_model_going_on_from_its_own_last_frames() -> None:
     acted = [actions(step, 1) for step in range(count)]
     seen = [env.step(action).observation.image[0] for action in acted]
 
-    def noise(clip: int, shape: tuple[int, ...]) -> Tensor:
-        fresh = initial_noise((shape[0], 1, *shape[2:]), torch.tensor([stream_seed(seed, "video_step", clip)]))
+    def of_new_frame(shape: tuple[int, ...], seeds: Tensor) -> Tensor:
+        fresh = initial_noise((shape[0], 1, *shape[2:]), seeds)
         return torch.cat([torch.zeros(1, shape[0], shape[1] - 1, *shape[2:]), fresh], 2)
 
+    def seeds(clip: int) -> Tensor:
+        return torch.tensor([stream_seed(seed, "video_step", clip)])
+
+    monkeypatch.setattr("wm_nodes.video_model.continuation.initial_noise", of_new_frame)
     start = Condition(
         folder.codec.encode(torch.from_numpy(first).unsqueeze(1)), torch.from_numpy(np.stack(acted, 1)),
         hashed_words(("push cube",), 4),
     )
     sampler = rollout_config(num_steps=4, shift=3.0)
-    latents = continue_videos(folder.network, start, ClipLengths(4, 1), count + 1, noise, sampler)
+    latents = continue_videos(folder.network, start, ClipLengths(4, 1), count + 1, seeds, sampler)
     expected = folder.codec.decode(latents)[0, 1:].numpy()
     assert np.abs(expected.astype(int) - np.stack(seen)).max() <= 1  # a batch of one rounds otherwise
     assert (np.diff(expected.astype(int), axis=0) != 0).any((1, 2, 3)).all()  # every frame is new

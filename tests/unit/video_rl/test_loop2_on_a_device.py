@@ -38,7 +38,7 @@ from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.flow_matching import train_video_model
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_model.tokenizer_codec import codec_of_world_model
-from wm_nodes.video_rl.execution_reward import load_execution_reward
+from wm_nodes.video_rl.execution_reward import make_execution_reward
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.pretraining import make_video_model
 from wm_nodes.video_rl.sampling import RecordedContexts, sample_by_ode
@@ -311,8 +311,8 @@ def test_an_action_world_model_pays_clips_where_the_video_model_is(device: Devic
     def work(where: str) -> Found:
         config = small_config(where, rewards={"execution": 1.0})
         folder = load_video_folder(world / "video_model_outcome", where)
-        reward = load_execution_reward(config, folder, recordings, probe_on(where, 64, 128))
-        assert reward is not None and device_of(folder.network).type == where
+        reward = make_execution_reward(config, folder, recordings, probe_on(where, 64, 128))
+        assert device_of(folder.network).type == where
         return reward.score(shown.frames.to(where), recordings.select(torch.arange(3)))
 
     check_both(device, work)

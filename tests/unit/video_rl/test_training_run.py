@@ -64,6 +64,12 @@ def test_an_error_that_grows_while_the_reward_rises_is_named_with_both_slopes() 
     assert alarm_text(none) == alarm_text({}) == ""
 
 
+def test_only_the_newest_evaluations_count() -> None:
+    rewards = [0.5, 0.4, 0.3, 0.4, 0.5, 0.6]
+    assert hacking_alarms(lines(rewards, tracking=[0.9, 0.5, 0.1, 0.2, 0.3, 0.4]), window=4) == {"hacked": 0.0}
+    assert hacking_alarms(lines(rewards, tracking=[0.1, 0.2, 0.9, 0.8, 0.7, 0.6]), window=4)["hacked"] == 1.0
+
+
 def test_the_object_that_moves_too_far_is_as_wrong_as_the_one_that_stays() -> None:
     assert more_is_better("motion", [0.5, 1.0, 1.5]).tolist() == [-0.5, 0.0, -0.5]
     assert hacked_slopes(hacking_alarms(lines([1, 2, 3], motion=[1.0, 1.2, 1.4]), window=3)) == {

@@ -19,7 +19,7 @@ from benchmarks.video_rl.comparison import SamplerComparison
 from benchmarks.video_rl.controls import TRAINING_CALLS, FlowMatchingLearner, RecordedTargets
 from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers
-from benchmarks.video_rl.sources import TASK, config_of
+from benchmarks.video_rl.sources import TASK, RecordedSource, config_of
 from benchmarks.video_rl.spread import reward_spread
 from benchmarks.video_rl.trainings import OnIteration, RecordedTrainings, row_name
 from benchmarks.video_rl.trials import SamplerTrial
@@ -33,7 +33,7 @@ from wm_nodes.video_model.success_reader import SUCCESS_MANIFEST, WEIGHTS
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.horizons import horizon_scores
 from wm_nodes.video_rl.reference_reward import load_probe, score_clips
-from wm_nodes.video_rl.sampling import RecordedContexts, sample_by_ode
+from wm_nodes.video_rl.sampling import sample_by_ode
 from wm_nodes.world_model.position_probe import PositionProbe
 
 PRESET, REWARDS = "closed_loop", {"tracking": 1.0}
@@ -90,15 +90,10 @@ def equal_compute(config: VideoRlConfig, control: str) -> tuple[int, int]:
     return round(sum(calls.values()) / each), DRAWS
 
 
-class ClosedLoopSource(RecordedContexts):
+class ClosedLoopSource(RecordedSource):
     """Continuations of the model's own histories; held-out contexts are rolled out whole, clip after clip."""
 
-    def __init__(
-        self, folder: VideoFolder, contexts: Clips, heldout: Clips, probe: PositionProbe, config: VideoRlConfig
-    ) -> None:
-        super().__init__(folder, contexts, config, probe)
-        self.network, self._heldout = folder.network, heldout
-        self._before: torch.Tensor | None = None
+    _before: torch.Tensor | None = None
 
     def measure(self, buffer: RolloutBuffer) -> dict[str, float]:
         return {"reward_spread": reward_spread(buffer)}
@@ -117,7 +112,7 @@ class ClosedLoopSource(RecordedContexts):
         return {name: values.tolist() for name, values in scores.items()}
 
 
-class RecordedSource(RecordedTargets, ClosedLoopSource):
+class TargetSource(RecordedTargets, ClosedLoopSource):
     """Recordings in place of continuations, validated alike."""
 
 
@@ -134,7 +129,7 @@ def train_arm(
         count, draws = equal_compute(config, sampler.name)
         config = config.with_values(groups=config.groups.with_values(contexts=count))
         keep: Literal["best", "all"] = "best" if sampler.name == BEST else "all"
-        source = ClosedLoopSource if sampler.name == BEST else RecordedSource
+        source = ClosedLoopSource if sampler.name == BEST else TargetSource
         learner = FlowMatchingLearner(
             folder.network, sampler.grpo, sampler.rollout, seed=seed, keep=keep, draws=draws
         )

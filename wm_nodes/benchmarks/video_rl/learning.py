@@ -75,7 +75,7 @@ def hacked(evaluations: list[dict[str, float]], proxy: str) -> list[str]:
         "mass": [-abs(row["mass"] - 1) for row in evaluations],
         "background": [-row["background"] for row in evaluations],
     }
-    return list(find_hacked_metrics([row[proxy] for row in evaluations], truths, window=len(evaluations)))
+    return list(find_hacked_metrics([row[proxy] for row in evaluations], truths))
 
 
 def alarms(row: dict[str, Any]) -> list[str]:

@@ -16,7 +16,7 @@ from benchmarks.video_rl import tables
 from benchmarks.video_rl.comparison import CLIP_MEASURES, SamplerComparison
 from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.samplers import LearningPlan, clip_learning_samplers
-from benchmarks.video_rl.sources import TASK, RecordedSource, recorded_episodes
+from benchmarks.video_rl.sources import TASK, RecordedSource, config_of, recorded_episodes
 from benchmarks.video_rl.trainings import OnIteration, Trainings
 from benchmarks.video_rl.trials import SamplerTrial
 from wm_nodes.config.load import load_video_config
@@ -67,7 +67,8 @@ class ClipLearning(Trainings[LearningPlan]):
                 (self.context_bags, self.contexts, NEW_CONTEXTS), (self.heldout_bags, self.eval_contexts, HELDOUT)
             )
         )
-        source = RecordedSource(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed)
+        config = config_of(trial.sampler, trial.plan, seed)
+        source = RecordedSource(folder, contexts, heldout, probe, config)
         return train_sampler(source, trial.sampler, trial.plan, seed, on_iteration)
 
     def show(self, rows: list[dict[str, Any]], comparisons: list[SamplerComparison]) -> None:
@@ -103,15 +104,10 @@ class Resolution(OnDevice):
             clips = load_clips(bags, folder.clip["stride"])
             clips = clips.first(self.contexts)
             if own is None:
-                own = sample_clips(folder, clips, config)
+                own = sample_by_ode(folder, clips, config, config.evaluation.num_steps)
             rows += size_rows(folder, clips, own, config, probe)
         self.write({"seed": self.seed, "sha256": folder.manifest["sha256"], "rows": rows})
         console.print(tables.resolution_table(rows))
-
-
-def sample_clips(folder: VideoFolder, contexts: Clips, config: VideoRlConfig) -> Tensor:
-    """One ODE clip of each context at the contexts' size, uint8 (E, F, H, W, 3)."""
-    return sample_by_ode(folder, contexts, config, config.evaluation.num_steps)
 
 
 def size_rows(
@@ -120,7 +116,7 @@ def size_rows(
     """Scores of each context, by what is shown. own: clips of the same contexts at the model's own size."""
     frames = contexts.frames
     shown = {
-        MODEL: sample_clips(folder, contexts, config),
+        MODEL: sample_by_ode(folder, contexts, config, config.evaluation.num_steps),
         ENLARGED: resized(own, *frames.shape[2:4]),
         CODEC: folder.codec.decode(folder.codec.encode(frames)),
         COPY: frames[:, :1].expand_as(frames),

@@ -66,16 +66,15 @@ class RecordedSource(RecordedContexts):
     """Contexts of recorded episodes; `heldout` are others."""
 
     def __init__(
-        self, folder: VideoFolder, contexts: Clips, heldout: Clips, probe: PositionProbe, sampler: SamplerSetup,
-        plan: LearningPlan, seed: int,
+        self, folder: VideoFolder, contexts: Clips, heldout: Clips, probe: PositionProbe, config: VideoRlConfig
     ) -> None:
-        super().__init__(folder, contexts, config_of(sampler, plan, seed), probe)
+        super().__init__(folder, contexts, config, probe)
         self.network, self._heldout = folder.network, heldout
 
     def measure(self, buffer: RolloutBuffer) -> dict[str, float]:
         return {}
 
-    def validate(self) -> dict[str, list[float]]:
+    def validate(self) -> Mapping[str, list[float]]:
         found = context_scores(self.folder, self._heldout, self.probe, self.config)
         return {name: values.tolist() for name, values in found.items()}
 

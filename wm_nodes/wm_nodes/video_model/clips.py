@@ -39,8 +39,8 @@ class Clips:
     """Of the simulator's reset, one each."""
     states: FloatArray
     """(E, F, S) of the tool."""
-    spec: EnvironmentSpec | None = None
-    """Of the environment that was recorded; None where unknown."""
+    spec: EnvironmentSpec
+    """Of the environment that was recorded."""
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -100,41 +100,34 @@ def load_clips(bags: Sequence[Path], stride: int, steps: int = 0) -> Clips:
     if lengths and not episodes:
         raise ValueError(f"no episode has {steps} steps, the longest {max(lengths)}; lower clip_steps")
     tasks = [episode.task for episode in episodes[:1]]
-    clips = cut_clips(stack_episodes(episodes, tasks, num_steps=steps or None), stride)
-    return replace(clips, spec=read_spec(bags[0]))
+    return cut_clips(stack_episodes(episodes, tasks, num_steps=steps or None), stride, read_spec(bags[0]))
 
 
 def checked(episode: Episode, bag: Path) -> Episode:
-    """The episode, whose actions are numbers, and each value of the simulator state in all frames or in none; recorded
-    without simulator state, with an unknown one.
+    """The episode, each value of whose simulator state is a number in all frames or in none; recorded without simulator
+    state, with an unknown one.
 
     Raises:
         ValueError: another one; names the first wrong value.
     """
     truth = episode.ground_truth
-    wrong = {"actions": ~np.isfinite(episode.actions), "ground_truth": ~np.isfinite(truth) & ~np.isnan(truth).all(0)}
-    for name, where in wrong.items():
-        if where.any():
-            place = tuple(int(i) for i in np.argwhere(where)[0])
-            raise ValueError(
-                f"{bag}: episode {episode.episode_id}: {name}{list(place)} is {getattr(episode, name)[place]}; record "
-                "the episode again, or leave its bag out"
-            )
+    wrong = ~np.isfinite(truth) & ~np.isnan(truth).all(0)
+    if wrong.any():
+        place = tuple(int(i) for i in np.argwhere(wrong)[0])
+        raise ValueError(
+            f"{bag}: episode {episode.episode_id}: ground_truth{list(place)} is {truth[place]}; record the episode "
+            "again, or leave its bag out"
+        )
     if truth.shape[1]:
         return episode
     names = get_task(episode.task).ground_truth_names
     return replace(episode, ground_truth=np.full((len(episode.images), len(names)), np.nan, np.float32))
 
 
-def cut_clips(episodes: EpisodeArrays, stride: int) -> Clips:
-    """Cut every stride-th frame of each episode, from its first one.
-
-    Raises:
-        ValueError: the episodes' steps are no multiple of the stride, or not all were recorded.
-    """
+def cut_clips(episodes: EpisodeArrays, stride: int, spec: EnvironmentSpec) -> Clips:
+    """Cut every stride-th frame of each episode, from its first one. Raises ValueError where their steps are no
+    multiple of the stride. episodes: of one length, none padded."""
     steps = episodes.num_steps
-    if (episodes.lengths < steps).any():
-        raise ValueError(f"an episode of {episodes.lengths.min()} steps is padded to {steps}; cut all to one length")
     if steps % stride:
         raise ValueError(f"episodes of {steps} steps cannot be cut at every {stride}th frame; choose a divisor")
     actions = episodes.actions.reshape(len(episodes), steps // stride, -1)
@@ -142,5 +135,5 @@ def cut_clips(episodes: EpisodeArrays, stride: int) -> Clips:
         frames=torch.from_numpy(np.ascontiguousarray(episodes.images[:, ::stride])),
         actions=torch.from_numpy(np.ascontiguousarray(actions)), ground_truth=episodes.ground_truth[:, ::stride],
         instructions=episodes.instructions, task=episodes.tasks[0], seeds=episodes.seeds,
-        states=episodes.states[:, ::stride],
+        states=episodes.states[:, ::stride], spec=spec,
     )

@@ -12,10 +12,7 @@ from torch import Tensor
 from wm_nodes.config.video import RolloutConfig
 from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.network import VelocityModel
-from wm_nodes.video_model.sampling import sample_videos
-
-ClipNoise = Callable[[int, tuple[int, ...]], Tensor]
-"""(number of the clip, shape (C, K + n, h, w)) -> its initial noise (N, C, K + n, h, w)."""
+from wm_nodes.video_model.sampling import initial_noise, sample_videos
 
 
 @dataclass(frozen=True)
@@ -51,18 +48,22 @@ def clip_condition(videos: Tensor, whole: Condition, lengths: ClipLengths) -> Co
 
 @torch.no_grad()
 def continue_videos(
-    model: VelocityModel, whole: Condition, lengths: ClipLengths, frames: int, noise: ClipNoise,
+    model: VelocityModel, whole: Condition, lengths: ClipLengths, frames: int, seeds: Callable[[int], Tensor],
     settings: RolloutConfig,
 ) -> Tensor:
     """Return videos (N, C, frames, h, w) of `whole`, where the model is, clip after clip by ODE; the last clip may be
-    shorter. Raises ValueError as clip_condition."""
+    shorter. Raises ValueError as clip_condition.
+
+    seeds: number of the clip, from 0 -> seeds (N,) of its initial noise.
+    """
     videos, clip = whole.frames, 0
-    seeds = torch.zeros(len(videos), dtype=torch.int64)  # of step noise, of which an ODE has none
     while videos.shape[2] < frames:
         new = min(lengths.new, frames - videos.shape[2])
         condition = clip_condition(videos, whole, ClipLengths(lengths.given, new))
         shape = (videos.shape[1], condition.num_conditioning + new, *videos.shape[3:])
-        rollout = sample_videos(model, condition, noise(clip, shape).to(videos.device), seeds, settings, [])
+        of_clip = seeds(clip)
+        noise = initial_noise(shape, of_clip).to(videos.device)
+        rollout = sample_videos(model, condition, noise, of_clip, settings, [])
         videos = torch.cat([videos, rollout.latents[:, :, -new:]], 2)
         clip += 1
     return videos

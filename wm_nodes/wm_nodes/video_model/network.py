@@ -190,8 +190,8 @@ def _places(x: Tensor, num_conditioning: int) -> Tensor:
 
 def guided_velocity(model: VelocityModel, x: Tensor, t: Tensor, condition: Condition, cfg: float) -> Tensor:
     """Return v_u + g (v_c - v_u) (DD-3b), g = cfg; 1 is off and costs one call instead of two."""
-    if cfg == 1:
-        return model(x, t, condition)
     conditional = model(x, t, condition)
+    if cfg == 1:
+        return conditional
     unconditional = model(x, t, condition, torch.ones(len(x), dtype=torch.bool, device=x.device))
     return unconditional + cfg * (conditional - unconditional)

@@ -4,8 +4,6 @@ Shapes: N environments, M starts, R rows of one call, C channels, G frames given
 grid, H W 3 image, A action.
 """
 
-from typing import Protocol
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -18,6 +16,7 @@ from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.video_model.conditions import Condition, hashed_words
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_model.sampling import initial_noise, sample_videos
+from wm_nodes.video_model.success_reader import SuccessReader
 from wm_nodes.world_model.imagined_episodes import DeviceEpisodes, ImaginedEpisodes, imagined_spec, put_where
 from wm_nodes.world_model.parts import in_parallel
 from wm_nodes.world_model.precision import compute_context
@@ -25,12 +24,6 @@ from wm_nodes.world_model.precision import compute_context
 ROWS = 16
 """Of each call of the models on a CPU, the last one filled up: with one batch size a row has the same bits beside any
 others. Fewer rows cost more each, more rows hardly less."""
-
-
-class DoneSignal(Protocol):
-    """Tells from uint8 frames (R, H, W, 3) with what probability the task is done in each, (R,); see success_reader."""
-
-    def read(self, frames: Tensor) -> FloatArray: ...
 
 
 class VideoEpisodes(DeviceEpisodes):
@@ -49,7 +42,7 @@ class VideoEpisodes(DeviceEpisodes):
     kind = "video model"
 
     def __init__(
-        self, folder: VideoFolder, reader: DoneSignal, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray],
+        self, folder: VideoFolder, reader: SuccessReader, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray],
         reward: RewardConfig, settings: VideoEnvironmentConfig, *, num_envs: int, exact: bool = False,
     ) -> None:
         check_steppable(folder, spec)

@@ -40,13 +40,6 @@ DECIMALS = 6
 """Of the correction: libraries differ in the last bits of a least-squares solution."""
 
 
-def load_execution_reward(
-    config: VideoRlConfig, folder: VideoFolder, recordings: Clips, probe: PositionProbe
-) -> "ExecutionReward | None":
-    """Return make_execution_reward(), or None where `execution` has no weight. Raises as that."""
-    return make_execution_reward(config, folder, recordings, probe) if config.rewards.get(EXECUTION) else None
-
-
 def make_execution_reward(
     config: VideoRlConfig, folder: VideoFolder, recordings: Clips, probe: PositionProbe
 ) -> "ExecutionReward":
@@ -58,12 +51,9 @@ def make_execution_reward(
     """
     model_dir = Path(config.execution.model) if config.execution.model else shipped_model(config.task)
     models = load_model_folder(model_dir, folder.device)
-    spec = recordings.spec
-    if spec is None:
-        raise ValueError("the reward execution needs recordings whose environment is known; load them from bags")
     models.task_index(recordings.task)
     remedy = "name another execution.model, or draw contexts from recordings that this one was trained with"
-    agree(tool_spec(spec), models.spec, f"{model_dir} was trained with", MODEL_FIELDS, simulated=remedy)
+    agree(tool_spec(recordings.spec), models.spec, f"{model_dir} was trained with", MODEL_FIELDS, simulated=remedy)
     return ExecutionReward(models, folder, recordings, probe)
 
 

@@ -47,7 +47,7 @@ def group_advantages(
     """
     rewards = rewards_N.double()
     valid, deviations, stds = torch.isfinite(rewards), torch.zeros_like(rewards), torch.ones_like(rewards)
-    kept, groups, num_dropped, num_zero = torch.zeros_like(valid), _groups(group_ids_N), 0, 0
+    kept, groups, num_dropped, num_zero = torch.zeros_like(valid), sorted(set(group_ids_N.tolist())), 0, 0
     for group in groups:
         of_group = group_ids_N == group
         members = of_group & valid
@@ -71,13 +71,9 @@ def best_of_n(advantages_N: Tensor, group_ids_N: Tensor, kept_N: Tensor, n: int)
     n = 0, or a group that is not larger than n: all stay. Equal advantages are ordered by their index.
     """
     chosen = kept_N.clone().bool()
-    for group in _groups(group_ids_N):
+    for group in sorted(set(group_ids_N.tolist())):
         members = torch.nonzero((group_ids_N == group) & kept_N).flatten()
         if 0 < n < len(members):
             order = members[torch.sort(advantages_N[members], stable=True).indices]
             chosen[order[n - n // 2 : len(order) - n // 2]] = False
     return chosen
-
-
-def _groups(group_ids_N: Tensor) -> list[int]:
-    return sorted({int(group) for group in group_ids_N})

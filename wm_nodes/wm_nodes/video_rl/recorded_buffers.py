@@ -6,7 +6,7 @@ Shapes: N clips of a buffer, F frames, H W 3 image.
 import hashlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -51,9 +51,9 @@ class RecordedClips:
     """What trains, float64 (N,), NaN where missing."""
     picture: UInt8Array | None
     """uint8 (N H, F W, 3), or None where not read."""
-    weights: Mapping[str, float] = field(default_factory=dict)
+    weights: Mapping[str, float]
     """Of the scores in the total."""
-    audit_ids: tuple[str, ...] = ()
+    audit_ids: tuple[str, ...]
     """Of the agent's verdicts (N,), "" for a failed one; () where it was not called."""
 
     def frames(self, height: int, width: int) -> Tensor:
@@ -84,10 +84,10 @@ class Rescored:
     """Of now."""
     different: tuple[str, ...]
     """Names of scores, `total` or `verdicts` whose bits are not the recorded ones."""
-    same_reward: bool = True
+    same_reward: bool
     """The total was recorded with the same rewards; else it is not compared."""
-    verdicts: tuple[Mapping[str, Any], ...] = ()
-    """The agent's, where it was called; clips without a recorded verdict are not compared."""
+    verdicts: tuple[Mapping[str, Any], ...]
+    """The agent's; () where it was not called. Clips without a recorded verdict are not compared."""
 
 
 BufferJudge = Callable[[RecordedClips, Tensor, Clips], tuple[Mapping[str, Tensor], tuple[Mapping[str, Any], ...]]]
@@ -201,7 +201,8 @@ def rescore(recorded: RecordedClips, source: RecordedContexts, judge: BufferJudg
     ids, answered = recorded.audit_ids, torch.ones(len(total), dtype=torch.bool)
     if verdicts and ids:
         answered = torch.tensor([bool(audit_id) for audit_id in ids])
-    different = [name for name, (old, new) in pairs.items() if not _bit_equal(old[answered], new[answered])]
+    bits = {name: [some[answered].numpy().tobytes() for some in pair] for name, pair in pairs.items()}
+    different = [name for name, (old, new) in bits.items() if old != new]
     if any(old and old != verdict["audit_id"] for old, verdict in zip(ids, verdicts)):
         different.append("verdicts")
     return Rescored(recorded, total, tuple(different), same_reward, verdicts)
@@ -279,7 +280,3 @@ def _join_scores(batch: Any, scores: Any, picture: UInt8Array | None, audit_ids:
         batch.sha256, dict(zip(scores.names, values, strict=True)), torch.where(valid, total, torch.nan), picture,
         dict(zip(scores.names, map(float, scores.weights), strict=True)), audit_ids,
     )
-
-
-def _bit_equal(theirs: Tensor, ours: Tensor) -> bool:
-    return theirs.dtype == ours.dtype and theirs.numpy().tobytes() == ours.numpy().tobytes()

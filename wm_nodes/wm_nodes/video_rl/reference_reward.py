@@ -6,7 +6,7 @@ none, the pictures themselves are compared. Nothing here is a learned preference
 the held-out metrics beside which a judge's reward is watched (DD-2).
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +20,6 @@ from wm_nodes.core.types import FloatArray
 from wm_nodes.reward.picture_similarity import psnr_db, ssim
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.tokenizer_codec import Codec
-from wm_nodes.video_rl.execution_reward import ExecutionReward
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.positions import columns_of, probe_targets
@@ -63,22 +62,6 @@ class ClipScores:
 
     def named(self) -> dict[str, Tensor]:
         return dict(vars(self))
-
-
-def all_scores(
-    frames: Tensor, references: Clips, probe: PositionProbe, codec: Codec, num_conditioning: int,
-    wanted: Collection[str], execution: ExecutionReward | None = None,
-) -> dict[str, Tensor]:
-    """Return the scores of score_clips() by name, and PICTURE_SCORES, which cost twice as much, where one is wanted.
-
-    execution: what load_execution_reward gives; its scores are among them.
-    """
-    scores = score_clips(frames, references, probe, num_conditioning).named()
-    if any(name in wanted for name in PICTURE_SCORES):
-        scores |= score_pictures(frames, references, codec, num_conditioning)
-    if execution is not None:
-        scores |= execution.score(frames, references)
-    return scores
 
 
 def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_conditioning: int) -> ClipScores:

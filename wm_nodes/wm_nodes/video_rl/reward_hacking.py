@@ -18,26 +18,21 @@ T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 """97.5 % quantile of Student's t for 1 to 9 degrees of freedom; the last serves more of them, a little wide."""
 
 
-def find_hacked_metrics(
-    proxy: Sequence[float], held_out: Mapping[str, Sequence[float]], *, window: int
-) -> dict[str, float]:
-    """Return by name the least-squares slope of each metric where it is < 0 over the last `window` evaluations while
-    the proxy's is > 0.
+def find_hacked_metrics(proxy: Sequence[float], held_out: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """Return by name the least-squares slope of each metric where it is < 0 while the proxy's is > 0.
 
-    Both count only where their 95 % interval (Student's, window - 2 degrees of freedom) leaves out 0: two flat, noisy
-    curves raise an alarm in less than one case of a thousand, however short the window.
+    Both count only where their 95 % interval (Student's, n - 2 degrees of freedom) leaves out 0: two flat, noisy curves
+    raise an alarm in less than one case of a thousand, however few the evaluations.
 
     Args:
-        proxy: the training reward at each evaluation. held_out: true metrics at the same ones, more is better.
-        window: at least 3.
+        proxy: the training reward at each of n >= 3 evaluations. held_out: true metrics at the same ones, more is
+            better.
     """
-    if len(proxy) < window:
-        return {}
-    widths = T_975[min(window - 2, len(T_975)) - 1]
-    rise, rise_error = slope(proxy[-window:])
+    widths = T_975[min(len(proxy) - 2, len(T_975)) - 1]
+    rise, rise_error = slope(proxy)
     if rise <= widths * rise_error:
         return {}
-    slopes = {name: slope(values[-window:]) for name, values in held_out.items()}
+    slopes = {name: slope(values) for name, values in held_out.items()}
     return {name: trend for name, (trend, error) in slopes.items() if trend < -widths * error}
 
 
@@ -68,8 +63,8 @@ def hacking_alarms(lines: Sequence[Mapping[str, Any]], window: int) -> dict[str,
     if len(proxy) < window:
         return {}
     names = [name for name in WATCHED if all(row.get(name) is not None for row in rows)]
-    curves = {name: more_is_better(name, [row[name] for row in rows]).tolist() for name in names}
-    found = find_hacked_metrics(proxy, curves, window=window)
+    curves = {name: more_is_better(name, [row[name] for row in rows[-window:]]).tolist() for name in names}
+    found = find_hacked_metrics(proxy[-window:], curves)
     alarms = {"reward_slope": slope(proxy[-window:])[0], **{f"hacked_{name}": found[name] for name in found}}
     return {"hacked": float(len(found)), **(alarms if found else {})}
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from wm_nodes.config.schema import EXECUTION
 from wm_nodes.config.video import RolloutConfig, VideoRlConfig
 from wm_nodes.core.device import device_of, explain_memory
 from wm_nodes.core.seeding import numpy_stream, stream_seed
@@ -20,8 +21,8 @@ from wm_nodes.video_model import (
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.continuation import ClipLengths, clip_condition, continue_videos
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_rl.execution_reward import load_execution_reward
-from wm_nodes.video_rl.reference_reward import all_scores, mix_rewards
+from wm_nodes.video_rl.execution_reward import ExecutionReward, make_execution_reward
+from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, mix_rewards, score_clips, score_pictures
 from wm_nodes.world_model.position_probe import PositionProbe
 
 
@@ -74,7 +75,7 @@ class RecordedContexts:
 
     Raises:
         ValueError: groups.history of a model that makes whole episodes, or of recordings that end before; as
-            load_execution_reward.
+            make_execution_reward.
     """
 
     def __init__(
@@ -86,7 +87,10 @@ class RecordedContexts:
             raise ValueError(
                 f"{clips} clips and one more have {wanted} frames, the recordings {frames}; lower groups.history"
             )
-        self.execution = None if probe is None else load_execution_reward(config, folder, contexts, probe)
+        self.execution: ExecutionReward | None = None
+        """Of the clips, where `execution` has a weight."""
+        if probe is not None and config.rewards.get(EXECUTION):
+            self.execution = make_execution_reward(config, folder, contexts, probe)
 
     @property
     def probe(self) -> PositionProbe:
@@ -134,12 +138,12 @@ class RecordedContexts:
             return start.repeat_interleave(request.group_size)
         lengths, contexts = self._lengths(), torch.arange(len(request.contexts))
 
-        def noise(clip: int, shape: tuple[int, ...]) -> Tensor:
+        def seeds(clip: int) -> Tensor:
             of = torch.full_like(contexts, clip)
-            return initial_noise(shape, _seeds(self.config.seed, "history_noise", request.iteration, contexts, of))
+            return _seeds(self.config.seed, "history_noise", request.iteration, contexts, of)
 
         frames, settings = self._made(request.history), _ode(self.config, self.config.rollout.num_steps)
-        videos = continue_videos(self.folder.network, start, lengths, frames, noise, settings)
+        videos = continue_videos(self.folder.network, start, lengths, frames, seeds, settings)
         return clip_condition(videos, start, lengths).repeat_interleave(request.group_size)
 
     def place(self, request: GroupRequest) -> tuple[int, int]:
@@ -160,13 +164,18 @@ class RecordedContexts:
         return clips.with_rewards({**scores, "total": mix_rewards(scores, self.config.rewards)})
 
     def scores(self, request: GroupRequest, frames: Tensor, also: Collection[str] = ()) -> dict[str, Tensor]:
-        """Return all_scores of the request's decoded clips, uint8 (N, F, H, W, 3).
+        """Return by name the scores of the request's decoded clips, uint8 (N, F, H, W, 3): those of score_clips(), of
+        `execution`, and where one is wanted PICTURE_SCORES, which cost twice as much.
 
         also: scores that are wanted beside the rewards.
         """
-        wanted, (_, given) = {*self.config.rewards, *also}, self.place(request)
-        codec, references = self.folder.codec, self.references(request)
-        return all_scores(frames, references, self.probe, codec, given, wanted, self.execution)
+        references, (_, given) = self.references(request), self.place(request)
+        scores = score_clips(frames, references, self.probe, given).named()
+        if not {*self.config.rewards, *also}.isdisjoint(PICTURE_SCORES):
+            scores |= score_pictures(frames, references, self.folder.codec, given)
+        if self.execution is not None:
+            scores |= self.execution.score(frames, references)
+        return scores
 
     def _made(self, history: int) -> int:
         """Frames of so many clips, the recorded first ones among them."""
@@ -188,13 +197,12 @@ def sample_by_ode(folder: VideoFolder, contexts: Clips, config: VideoRlConfig, n
     """
     rows, condition = torch.arange(len(contexts)), _condition(folder, contexts, config)
 
-    def noise(clip: int, shape: tuple[int, ...]) -> Tensor:
-        seeds = _seeds(config.seed, "clip_evaluation", clip, rows, torch.zeros_like(rows))
-        return initial_noise(shape, seeds).to(folder.device)
+    def seeds(clip: int) -> Tensor:
+        return _seeds(config.seed, "clip_evaluation", clip, rows, torch.zeros_like(rows))
 
     K, count = condition.num_conditioning, contexts.frames.shape[1]
     lengths = folder.lengths or ClipLengths(K, count - K)
-    videos = continue_videos(folder.network, condition, lengths, count, noise, _ode(config, num_steps))
+    videos = continue_videos(folder.network, condition, lengths, count, seeds, _ode(config, num_steps))
     return folder.codec.decode(videos)
 
 

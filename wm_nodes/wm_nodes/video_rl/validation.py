@@ -17,9 +17,9 @@ from wm_nodes.core.model_folder import AGAIN, read_json
 from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_rl.execution_reward import EXECUTION_SCORES, load_execution_reward
-from wm_nodes.video_rl.reference_reward import all_scores, load_probe, mix_rewards
-from wm_nodes.video_rl.sampling import sample_by_ode
+from wm_nodes.video_rl.execution_reward import EXECUTION_SCORES
+from wm_nodes.video_rl.reference_reward import load_probe, mix_rewards
+from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts, sample_by_ode
 from wm_nodes.world_model.position_probe import PositionProbe
 
 OUTCOMES = ("success", "outcome", *EXECUTION_SCORES)
@@ -36,12 +36,11 @@ def context_scores(
     Where the model chooses the motion, how near it is to the recorded one says nothing, and is left out.
     """
     contexts = heldout.first(config.evaluation.contexts)
+    whole = config.with_values(groups=config.groups.with_values(history=0))
     folder.network.eval()
     frames = sample_by_ode(folder, contexts, config, config.evaluation.num_steps)
-    scores = all_scores(
-        frames, contexts, probe, folder.codec, folder.clip["num_conditioning"], config.rewards,
-        load_execution_reward(config, folder, contexts, probe),
-    )
+    request = GroupRequest(tuple(range(len(contexts))), group_size=1, iteration=0, policy_version=0)
+    scores = RecordedContexts(folder, contexts, whole, probe).scores(request, frames)
     return {name: scores[name] for name in OUTCOMES if name in scores} if config.groups.hide_actions else scores
 
 
