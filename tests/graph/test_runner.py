@@ -27,11 +27,17 @@ def tiny(name: str, **parameters: object) -> NodeSpec:
     return NodeSpec("graph.tiny_node", name, "/wm", parameters, lifecycle=False)
 
 
-def graph(*nodes: NodeSpec, forks: bool = True) -> Graph:
-    """forks: nodes fork where there are several; a node with an environment of its own never does."""
+def graph(*nodes: NodeSpec) -> Graph:
     path = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
-    own = {} if forks else {"WM_OWN": "1"}
-    return Graph("tiny", tuple(replace(node, environment=own) for node in nodes), {"PYTHONPATH": path})
+    return Graph("tiny", nodes, {"PYTHONPATH": path})
+
+
+@pytest.fixture(params=[True, False])
+def forks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Whether nodes fork, as several do; else each is an interpreter of its own."""
+    if not request.param:
+        monkeypatch.setattr(launching_runner, "_can_fork", lambda node: False)
+    return bool(request.param)
 
 
 def state_and_parent(pid: int) -> list[str]:
@@ -50,44 +56,40 @@ def alive(pid: int) -> bool:
         return False
 
 
-@pytest.mark.parametrize("forks", [True, False])
 def test_nodes_start_become_ready_and_end_without_a_trace(ros_domain: int, tmp_path: Path, forks: bool) -> None:
     log = io.StringIO()
-    with Runner(graph(tiny("a", text="1"), tiny("b"), forks=forks), log=log, log_dir=tmp_path) as runner:
+    with Runner(graph(tiny("a", text="1"), tiny("b")), log=log, log_dir=tmp_path) as runner:
         runner.wait_ready(30)
-        pids = [runner.pid("a"), runner.pid("wm/b")]
+        pids = [runner.process("a").pid, runner.process("wm/b").pid]
         assert all(os.getpgid(pid) == pid for pid in pids)
         assert all((parent(pid) == os.getpid()) != forks for pid in pids)
         assert all("-m\0graph.tiny_node\0" in Path(f"/proc/{pid}/cmdline").read_text() for pid in pids)
         assert runner.failure() is None
     assert not any(alive(pid) for pid in pids)
-    assert runner.wait_ended("a") == runner.wait_ended("b") == 0
+    assert [runner.process(name).wait(10) for name in "ab"] == [0, 0]
     assert f"[wm/a] tiny says '1' on domain {ros_domain}" in log.getvalue()
     assert "tiny says '1'" in (tmp_path / "wm.a.log").read_text()
 
 
-@pytest.mark.parametrize("forks", [True, False])
 def test_end_of_a_required_node_is_reported_with_its_last_words_and_code(ros_domain: int, forks: bool) -> None:
     log = io.StringIO()
-    with Runner(graph(tiny("short", die_after_s=1.0), tiny("long"), forks=forks), log=log) as runner:
+    with Runner(graph(tiny("short", die_after_s=1.0), tiny("long")), log=log) as runner:
         assert runner.wait(timeout_s=60) == 7
         with pytest.raises(NodeDiedError, match="required node wm/short ended with code 7: tiny gives up"):
             runner.check()
     assert "[runner] required node wm/short ended with code 7" in log.getvalue()
 
 
-@pytest.mark.parametrize("forks", [True, False])
 @pytest.mark.kills
 def test_death_by_sigkill_is_reported_within_five_seconds(ros_domain: int, forks: bool) -> None:
-    with Runner(graph(tiny("a"), tiny("b"), forks=forks), log=None) as runner:
+    with Runner(graph(tiny("a"), tiny("b")), log=None) as runner:
         runner.wait_ready(30)
-        os.kill(runner.pid("b"), signal.SIGKILL)
+        os.kill(runner.process("b").pid, signal.SIGKILL)
         since = time.monotonic()
         assert runner.wait(timeout_s=30) == 128 + signal.SIGKILL
         assert time.monotonic() - since < within(5.0)
 
 
-@pytest.mark.parametrize("forks", [True, False])
 @pytest.mark.kills
 def test_a_node_that_is_to_respawn_comes_back_and_one_that_ends_at_once_does_not(
     ros_domain: int, forks: bool, monkeypatch: pytest.MonkeyPatch
@@ -95,25 +97,26 @@ def test_a_node_that_is_to_respawn_comes_back_and_one_that_ends_at_once_does_not
     monkeypatch.setattr(launching_runner, "LEAST_LIFE_S", 2.0)
     nodes = [replace(tiny(name), respawn=True) for name in "ab"]
     log = io.StringIO()
-    with Runner(graph(*nodes, forks=forks), log=log) as runner:
+    with Runner(graph(*nodes), log=log) as runner:
         runner.wait_ready(30)
         time.sleep(2.0)
-        first = runner.pid("a")
+        first = runner.process("a").pid
         os.kill(first, signal.SIGKILL)
-        assert runner.wait(timeout_s=15, until=lambda: runner.pid("a") != first) == 0
-        assert runner.pid("a") != first and runner.failure() is None
+        assert runner.wait(timeout_s=15, until=lambda: runner.process("a").pid != first) == 0
+        assert runner.process("a").pid != first and runner.failure() is None
         assert "required node wm/a was ended by SIGKILL" in log.getvalue() and "starting it again" in log.getvalue()
-        os.kill(runner.pid("a"), signal.SIGKILL)
+        os.kill(runner.process("a").pid, signal.SIGKILL)
         assert runner.wait(timeout_s=30) == 128 + signal.SIGKILL
 
 
 @pytest.mark.kills
 def test_node_that_ignores_sigint_and_sigterm_is_killed_in_the_end(ros_domain: int) -> None:
-    with Runner(graph(tiny("a", stubborn=True)), log=None) as runner:
+    log = io.StringIO()
+    with Runner(graph(tiny("a", stubborn=True)), log=log) as runner:
         runner.wait_ready(30)
-        pid = runner.pid("a")
+        pid = runner.process("a").pid
         since = time.monotonic()
-    assert not alive(pid) and runner.killed
+    assert not alive(pid) and "killed, because 10 s were not enough: wm/a" in log.getvalue()
     assert time.monotonic() - since < within(20)
 
 
@@ -124,11 +127,12 @@ def test_nodes_end_with_their_fork_server_and_come_back_without_it(
     monkeypatch.setattr(launching_runner, "LEAST_LIFE_S", 0.0)
     with Runner(graph(*(replace(tiny(name), respawn=True) for name in "ab")), log=None) as runner:
         runner.wait_ready(30)
-        pids = [runner.pid("a"), runner.pid("b")]
+        nodes = [runner.process("a"), runner.process("b")]
+        pids = [node.pid for node in nodes]
         assert parent(pids[0]) == parent(pids[1])
         os.kill(parent(pids[0]), signal.SIGKILL)
-        assert runner.wait(timeout_s=30, until=lambda: not {runner.pid("a"), runner.pid("b")} & {*pids}) == 0
-        assert parent(runner.pid("a")) == os.getpid()
+        assert runner.wait(timeout_s=30, until=lambda: not {node.pid for node in nodes} & {*pids}) == 0
+        assert parent(nodes[0].pid) == os.getpid()
         assert not any(alive(pid) for pid in pids)
 
 
@@ -210,7 +214,7 @@ def test_nodes_do_not_outlive_a_killed_starter(ros_domain: int, tmp_path: Path) 
         "import time; from graph.test_runner import graph, tiny\n"
         "from wm_nodes.launching.runner import Runner\n"
         "with Runner(graph(tiny('a'), tiny('b')), log=None) as runner:\n"
-        "    runner.wait_ready(30); print(runner.pid('a'), flush=True); time.sleep(60)\n"
+        "    runner.wait_ready(30); print(runner.process('a').pid, flush=True); time.sleep(60)\n"
     )
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])}
     process = subprocess.Popen([sys.executable, str(script)], env=env, stdout=subprocess.PIPE, text=True)
@@ -227,7 +231,7 @@ def test_nodes_do_not_outlive_a_killed_starter(ros_domain: int, tmp_path: Path) 
 def test_big_shared_memory_segment_of_the_profile_is_in_use(ros_domain: int) -> None:
     with Runner(graph(tiny("a")), log=None) as runner:
         runner.wait_ready(30)
-        mapped = Path(f"/proc/{runner.pid('a')}/maps").read_text()
+        mapped = Path(f"/proc/{runner.process('a').pid}/maps").read_text()
         sizes = []
         for line in mapped.splitlines():
             if "/dev/shm/fastrtps_" in line:

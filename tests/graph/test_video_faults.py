@@ -253,14 +253,14 @@ def test_cancel_is_answered_at_once_during_an_update_and_takes_it_back(loop: Vid
 def test_a_full_disk_ends_training_as_failed_with_one_error_and_the_last_checkpoint_loads(loop: VideoLoop) -> None:
     learner, before = loop.graph.processes["/wm/video_learner"], loop.train(1)
     checkpoint = loop.graph.folder / CHECKPOINT
-    complete, errors = checkpoint.read_bytes(), loop.graph.log("/wm/video_learner").count("training ended")
+    complete, errors = checkpoint.read_bytes(), loop.graph.log("/wm/video_learner").count("video/train failed")
     full_disk(learner, 10_000)
     failed = loop.train(2)
     assert failed.termination_reason == TrainVideo.Result.FAILED
     assert "cannot write" in failed.message and "free some space" in failed.message
     assert checkpoint.read_bytes() == complete
     log = loop.graph.log("/wm/video_learner")
-    assert log.count("training ended") == errors + 1 and "Traceback" not in log
+    assert log.count("video/train failed") == errors + 1 and "Traceback" not in log
     network, config = load_video_folder(loop.model).network, loop.config
     loaded = GrpoLearner(network, config.grpo, config.rollout, seed=config.seed)
     loaded.load(checkpoint)

@@ -158,13 +158,13 @@ def test_a_viewer_that_cannot_open_its_page_does_not_end_the_graph(ros_domain: i
         ]
         with Runner(runner_graph(tiny("a"), *viewers), log=None, log_dir=tmp_path) as runner:
             runner.wait_ready(60)
-            assert runner.wait_ended("refused", 60) == 1
+            assert runner.process("refused").wait(60) == 1
             text = (tmp_path / "wm.refused.log").read_text()
             assert f"error: port {other.port} of this host cannot be used" in text and "Traceback" not in text
             log = tmp_path / "wm.viewer.log"
             wait_until("the page", lambda: log.is_file() and "live page http" in log.read_text())
             assert runner.wait(0.5) == 0 and runner.failure() is None
-        assert runner.wait_ended("viewer") == 0, "SIGINT ends it in order"
+        assert runner.process("viewer").wait(10) == 0, "SIGINT ends it in order"
 
 
 def test_the_benchmark_counts_the_cpu_time_of_the_nodes_with_and_without_the_page(tmp_path: Path) -> None:

@@ -70,9 +70,9 @@ class View(Experiment):
             if way == OPEN:
                 threading.Thread(target=deque, args=(_events(given["view_port"]), 0), daemon=True).start()
             operator.rollout(20)
-            before = {node.name: used_cpu_s(stat_fields(runner.pid(node.name))) for node in graph.nodes}
+            before = {node.name: used_cpu_s(stat_fields(runner.process(node.name).pid)) for node in graph.nodes}
             operator.rollout(self.steps)
-            return {name: used_cpu_s(stat_fields(runner.pid(name))) - spent for name, spent in before.items()}
+            return {name: used_cpu_s(stat_fields(runner.process(name).pid)) - spent for name, spent in before.items()}
 
 
 def _events(port: str) -> Any:

@@ -69,7 +69,7 @@ class DomainLock:
         self.release()
 
 
-def first_free(domains: Iterable[int], holder: str, *, group: str, folder: Path = LOCK_FOLDER) -> DomainLock:
+def first_free(domains: Iterable[int], holder: str, *, group: str) -> DomainLock:
     """Return the held lock of the first free domain.
 
     Raises:
@@ -77,7 +77,7 @@ def first_free(domains: Iterable[int], holder: str, *, group: str, folder: Path 
     """
     tried = list(domains)
     for domain in tried:
-        lock = DomainLock(domain, holder, group=group, folder=folder)
+        lock = DomainLock(domain, holder, group=group)
         try:
             lock.acquire()
         except DomainInUseError:

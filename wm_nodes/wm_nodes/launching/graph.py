@@ -47,8 +47,6 @@ class NodeSpec:
     """Where the starter keeps carried_parameters() of a composed process."""
     extra_parameters: str = ""
     """A parameter file of the user; read last, so it wins."""
-    environment: Mapping[str, str] = field(default_factory=dict)
-    """Variables on top of the graph's."""
 
     @property
     def full_name(self) -> str:

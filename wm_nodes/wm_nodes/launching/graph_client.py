@@ -1,15 +1,13 @@
 """Steer a running graph from a plain program: send goals, show feedback, fetch results."""
 
-import threading
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
-import rclpy
 from rclpy.action import ActionClient
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 
 from wm_msgs.action import Evaluate, Rollout, Train, TrainVideo
 from wm_msgs.msg import RunState
@@ -19,7 +17,7 @@ from wm_nodes.ros.clients import run_goal, same_process
 from wm_nodes.ros.liveliness import HEARTBEAT_S, PeerWatch, activities_here
 from wm_nodes.ros.params import PEER_TIMEOUT_S
 from wm_nodes.ros.qos import topic
-from wm_nodes.ros.spin import make_executor, spin
+from wm_nodes.ros.spin import init, spinning
 
 ACCEPT_S = 30.0
 
@@ -38,8 +36,7 @@ class GraphClient:
 
     def __init__(self, namespace: str = "wm", *, alive: Callable[[], None] = lambda: None) -> None:
         self._alive = alive
-        self._stop = threading.Event()
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        init()
         self._node = Node("operator", namespace=namespace)
         self._peers = PeerWatch("", PEER_TIMEOUT_S, activities_here())
         row = topic("run/state")
@@ -49,10 +46,8 @@ class GraphClient:
         self._train = ActionClient(self._node, Train, "train")
         self._evaluate = ActionClient(self._node, Evaluate, "evaluate")
         self._train_video = ActionClient(self._node, TrainVideo, "video/train")
-        self._executor = make_executor("events")
-        self._executor.add_node(self._node)
-        self._thread = threading.Thread(target=spin, args=(self._executor, self._stop.is_set), daemon=True)
-        self._thread.start()
+        self._spinning = ExitStack()
+        self._spinning.enter_context(spinning(self._node))
 
     def rollout(self, steps: int, *, seed: int = 0, deterministic: bool = False) -> Rollout.Result:
         """Let the policy act, by default with its noise, in so many lock-steps after a reset.
@@ -99,13 +94,6 @@ class GraphClient:
         goal = TrainVideo.Goal(iterations=iterations)
         self._run(self._train_video, "learner", goal, lambda message: on_progress(message.feedback))
 
-    def close(self) -> None:
-        self._stop.set()
-        self._thread.join()
-        self._executor.remove_node(self._node)
-        self._node.destroy_node()
-        rclpy.try_shutdown()
-
     def _run(
         self, client: ActionClient, server: str, goal: Any, on_feedback: Callable[[Any], None],
         ends: Sequence[int] = (0,),
@@ -127,4 +115,4 @@ class GraphClient:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.close()
+        self._spinning.close()

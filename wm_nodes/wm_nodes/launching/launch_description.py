@@ -95,7 +95,7 @@ def prepare_graph(scenario: str, given: Mapping[str, str], python: str) -> Graph
 def node_actions(graph: Graph, python: str) -> list[Any]:
     """One launch_ros Node per NodeSpec; the end of one shuts the launch down, or starts it again."""
     environment = graph_environment(graph.environment, python=python)
-    return [_action(node, python, {**environment, **node.environment}) for node in graph.nodes]
+    return [_action(node, python, environment) for node in graph.nodes]
 
 
 def _action(node: NodeSpec, python: str, environment: dict[str, str]) -> Any:

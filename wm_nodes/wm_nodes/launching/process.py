@@ -5,7 +5,6 @@ import signal
 import subprocess
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from functools import partial
@@ -30,26 +29,21 @@ class NodeProcess:
         self.started_at = 0.0
         self.ended_at: float | None = None
         """time.monotonic() of the end, or None while it runs."""
-        self._env = {**env, **spec.environment}
+        self._env = env
         self._log = log
         label = spec.label.ljust(width)
         self._prefix = f"[{label}] " if colour is None else f"\x1b[{COLOURS[colour % len(COLOURS)]}m[{label}]\x1b[0m "
         self._file = file
-        self._lines: deque[str] = deque(maxlen=1000)
-        self._pid: int | None = None
+        self._last_line = "no output"
+        self.pid = 0
+        """0 before the first start."""
         self._code = 0
         self._ended = threading.Event()
         self._pump: threading.Thread | None = None
 
     @property
     def running(self) -> bool:
-        return self._pid is not None and not self._ended.is_set()
-
-    @property
-    def pid(self) -> int:
-        if self._pid is None:
-            raise RuntimeError(f"{self.spec.label} was never started")
-        return self._pid
+        return self.pid != 0 and not self._ended.is_set()
 
     @property
     def exit_code(self) -> int:
@@ -65,7 +59,7 @@ class NodeProcess:
         self._ended.clear()
         reader, output = os.pipe()
         try:
-            self._pid, wait = self._launch(forks, output)
+            self.pid, wait = self._launch(forks, output)
         except BaseException:
             os.close(reader)
             raise
@@ -93,10 +87,6 @@ class NodeProcess:
         if self._pump is not None:
             self._pump.join(timeout=5.0)
 
-    def output(self) -> str:
-        """The last 1000 lines."""
-        return "".join(list(self._lines))
-
     def exit_summary(self) -> str:
         """One line for people: who ended, how, its last output, where the rest is."""
         self.close()
@@ -107,8 +97,7 @@ class NodeProcess:
 
     def last_output_line(self) -> str:
         """The last line written, and where the rest is."""
-        last = next((line.strip() for line in reversed(self._lines) if line.strip()), "no output")
-        return last + (f" (log: {self._file})" if self._file else "")
+        return self._last_line + (f" (log: {self._file})" if self._file else "")
 
     def _launch(self, forks: ForkServer | None, output: int) -> tuple[int, Callable[[], int]]:
         """Return the pid, and what waits for the exit code."""
@@ -127,7 +116,7 @@ class NodeProcess:
             stack.enter_context(stream)
             sink = stack.enter_context(self._file.open("a", encoding="utf-8")) if self._file is not None else None
             for line in stream:
-                self._lines.append(line)
+                self._last_line = line.strip() or self._last_line
                 if sink is not None:
                     sink.write(line)
                     sink.flush()

@@ -22,7 +22,7 @@ from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.domain_lock import DomainInUseError, DomainLock
 from wm_nodes.launching.environment import graph_environment, interpreter
 from wm_nodes.launching.fork_server import ForkServer
-from wm_nodes.launching.graph import RESPAWN_S, Graph, GraphError, NodeSpec
+from wm_nodes.launching.graph import RESPAWN_S, Graph, NodeSpec
 from wm_nodes.launching.process import NodeProcess
 from wm_nodes.launching.readiness import NotReadyError, activate, wait_ready
 from wm_nodes.launching.scenarios import describe_arguments, parse_arguments, run_folder
@@ -47,35 +47,30 @@ class Runner:
     """The processes of one graph. start() and stop() are called by the context manager.
 
     Args:
-        env: variables on top of the graph's own.
         log: where prefixed lines go; None: nowhere.
         log_dir: folder for one <node>.log each; None: no files.
-        colour: colour the prefixes; None: if `log` is a terminal.
         python: interpreter of the nodes.
         use_domain_lock: refuse a domain on which another Runner of this host works.
     """
 
     def __init__(
-        self, graph: Graph, *, env: Mapping[str, str] | None = None, log: TextIO | None = sys.stdout,
-        log_dir: Path | None = None, colour: bool | None = None, python: str = sys.executable,
-        use_domain_lock: bool = True,
+        self, graph: Graph, *, log: TextIO | None = sys.stdout, log_dir: Path | None = None,
+        python: str = sys.executable, use_domain_lock: bool = True,
     ) -> None:
         self.graph = graph
-        self.environment = graph_environment({**graph.environment, **(env or {})}, python=python)
+        self.environment = graph_environment(graph.environment, python=python)
         """Variables that every process gets."""
         self.domain = _domain(self.environment)
         self._lock = DomainLock(self.domain, f"graph {graph.name!r}") if use_domain_lock else None
         self._log = log
         self._log_dir = log_dir
-        self._colour = (log is not None and log.isatty()) if colour is None else colour
+        self._colour = log is not None and log.isatty()
         self._python = python
         self._processes: dict[str, NodeProcess] = {}
         # Linux signals a child when the *thread* that made it ends; this one lives until stop().
         self._starter: ThreadPoolExecutor | None = None
         self._forks: ForkServer | None = None
         self._stopping = False
-        self.killed = False
-        """Whether a node had to be ended by SIGKILL."""
 
     def start(self) -> None:
         """Start every process.
@@ -178,16 +173,9 @@ class Runner:
                 self._say(f"{process.exit_summary()}; starting it again")
                 self._start(label)
 
-    def wait_ended(self, name: str, timeout_s: float = 10.0) -> int:
-        """Return the exit code (negative: the signal) of a node once it has ended.
-
-        Raises:
-            TimeoutError: it still runs.
-        """
-        return self._processes[self.graph.node(name).label].wait(timeout_s)
-
-    def pid(self, name: str) -> int:
-        return self._processes[self.graph.node(name).label].pid
+    def process(self, name: str) -> NodeProcess:
+        """The process of a node, as Graph.node finds it."""
+        return self._processes[self.graph.node(name).label]
 
     def stop(self) -> None:
         """End everything: SIGINT, 5 s, SIGTERM, 5 s, SIGKILL; then clean shared memory and free the domain."""
@@ -227,7 +215,6 @@ class Runner:
             for process in running:
                 process.signal(number)
             if number == signal.SIGKILL and running:
-                self.killed = True
                 self._say(f"killed, because 10 s were not enough: {', '.join(p.spec.label for p in running)}")
             deadline = time.monotonic() + GRACE_S
             while any(process.running for process in running) and time.monotonic() < deadline:
@@ -285,7 +272,7 @@ def main(scenario: str, argv: Sequence[str] | None = None) -> int:
         with RunLock(run_dir, say=_print, new=not given.get("run_dir")) as lock:
             graph, values = launch_arguments.begin(scenario, {**given, "run_dir": str(lock.folder)})
             return run(graph, lock.folder, interpreter(values))
-    except (GraphError, DomainInUseError, ValueError, OSError, NotReadyError) as error:
+    except (DomainInUseError, ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
 
@@ -294,7 +281,7 @@ def run(graph: Graph, run_dir: Path, python: str = sys.executable, ready_s: floa
     """Run a graph until Ctrl-C or SIGTERM (exit code 0; 130 before it is ready), or the end of a required node.
 
     Raises:
-        RunFolderInUseError: another process writes into run_dir. DomainInUseError, NotReadyError: as the Runner.
+        DomainInUseError, NotReadyError: as the Runner.
         KeyboardInterrupt: while the processes were made.
     """
     received: list[int] = []
@@ -310,10 +297,7 @@ def run(graph: Graph, run_dir: Path, python: str = sys.executable, ready_s: floa
     if reach not in {"LOCALHOST", "OFF"}:
         print(f"WARNING: discovery range {reach}: whoever reaches this network can steer the graph", flush=True)
     try:
-        with (
-            RunLock(run_dir, say=_print),
-            Runner(graph, log_dir=run_dir / "logs", python=python) as runner,
-        ):
+        with Runner(graph, log_dir=run_dir / "logs", python=python) as runner:
             starting = False
             print(f"[runner] {len(graph.nodes)} processes, domain {runner.domain}, run folder {run_dir}", flush=True)
             try:
@@ -349,8 +333,8 @@ def preloaded(graph: Graph) -> list[str]:
 
 
 def _can_fork(node: NodeSpec) -> bool:
-    """Whether the node can fork: torchrun starts its own processes, and variables may count from the first moment."""
-    return node.ranks == 1 and not node.environment
+    """Whether the node can fork: torchrun starts its own processes."""
+    return node.ranks == 1
 
 
 def _comes_back(process: NodeProcess) -> bool:

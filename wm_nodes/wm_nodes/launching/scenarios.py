@@ -140,9 +140,9 @@ def parse_arguments(scenario: str, given: Mapping[str, str]) -> dict[str, str]:
     return {name: given.get(name, _BY_NAME[name].default) for name in names}
 
 
-def run_folder(scenario: str, given: Mapping[str, str], now: datetime | None = None) -> Path:
+def run_folder(scenario: str, given: Mapping[str, str]) -> Path:
     """The folder that argument run_dir names; where it is empty, a new one of this moment."""
-    time = (now or datetime.now()).strftime("%Y%m%d-%H%M%S")
+    time = datetime.now().strftime("%Y%m%d-%H%M%S")
     return Path(given.get("run_dir") or f"runs/{time}-{scenario}").expanduser().absolute()
 
 

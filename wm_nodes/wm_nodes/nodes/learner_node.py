@@ -156,8 +156,10 @@ class LearnerNode(TrainingNode):
                     return
                 following = self._next(source, live=not goal.from_bags and not goal.from_replay)
                 if following is None:
-                    result.termination_reason = Train.Result.EXHAUSTED if update else Train.Result.FAILED
-                    result.message = self._exhausted(goal, update, source.left_out)
+                    text = self._exhausted(goal, update, source.left_out)
+                    if not update:
+                        raise ValueError(text)
+                    result.termination_reason, result.message = Train.Result.EXHAUSTED, text
                     return
                 self._count_dropped(following[1])
                 self._update(work, goal, update, *following)

@@ -192,7 +192,8 @@ class PolicyNode(ManagedNode):
     def _check_spec(self, spec: EnvironmentSpec) -> None:
         if self._expected_spec is not None:
             refuse_other(spec, self._expected_spec, "the policy needs")
-        dims, expected = (spec.state_dim, spec.action_dim), (self._holder.state_dim, self._holder.action_dim)
+        policy = self._holder.policy
+        dims, expected = (spec.state_dim, spec.action_dim), (policy.state_dim, policy.action_dim)
         if dims != expected:
             raise WireError(
                 ErrorCode.SPEC_MISMATCH,
@@ -270,7 +271,7 @@ class PolicyNode(ManagedNode):
         self.require_active()
         if self._spec is None:
             raise WireError(ErrorCode.NOT_ACTIVE, "no env/spec seen yet; start an environment or replay a bag")
-        count = len(request.state) // self._holder.state_dim
+        count = len(request.state) // self._holder.policy.state_dim
         spec = replace(self._spec, num_envs=max(count, 1))
         states = floats(request.state, (spec.num_envs, spec.state_dim), "state")
         if not np.isfinite(states).all():

@@ -27,7 +27,7 @@ from wm_nodes.reports.live_page import LivePage
 from wm_nodes.ros.middleware import set_node_defaults
 from wm_nodes.ros.params import COMMON, Param, declare
 from wm_nodes.ros.qos import topic
-from wm_nodes.ros.spin import destroy, executor_kind, init, make_executor, spin, stop_on_signals
+from wm_nodes.ros.spin import destroy, init, make_executor, spin, stop_on_signals
 
 PARAMS = (Param("port", 0, "Of the page, on this host only; 0: a free one", read_only=True, minimum=0, maximum=65535),)
 NICENESS = 10
@@ -103,7 +103,7 @@ def main() -> int:
         init()
         with stop_on_signals() as stopped:
             node = ViewerNode()
-            executor = make_executor(executor_kind(node))
+            executor = make_executor(str(node.get_parameter("executor").value))
             executor.add_node(node)
             spin(executor, stopped)
             node.page.close()

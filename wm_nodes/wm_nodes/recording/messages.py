@@ -7,7 +7,7 @@ What is decoded is a view of the message's bytes, no copy. WireError refuses wha
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -76,11 +76,11 @@ def deserialize(data: bytes | memoryview, msgtype: str) -> Any:
     return typestore().deserialize_cdr(data, msgtype)
 
 
-def image_message(mosaic: UInt8Array, time_ns: int, *, encoding: str = "rgb8") -> Any:
+def image_message(mosaic: UInt8Array, time_ns: int) -> Any:
     """sensor_msgs/Image of an uint8 (H, W, 3) mosaic."""
     height, width, channels = mosaic.shape
     return message_type("sensor_msgs/msg/Image")(
-        header=header(time_ns, BASE_FRAME), height=height, width=width, encoding=encoding, is_bigendian=0,
+        header=header(time_ns, BASE_FRAME), height=height, width=width, encoding="rgb8", is_bigendian=0,
         step=width * channels, data=np.ascontiguousarray(mosaic).reshape(-1),
     )
 
@@ -242,8 +242,3 @@ def spec_from_json(text: str) -> EnvironmentSpec:
         return spec_of_values(json.loads(text))
     except ValueError as error:
         raise BagError(f"wm.spec_json: {error}; read the bag with the version that wrote it") from None
-
-
-def single(spec: EnvironmentSpec) -> EnvironmentSpec:
-    """The spec of one environment slot of `spec`, as EpisodeBagWriter records it."""
-    return replace(spec, num_envs=1)

@@ -10,8 +10,8 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosDurability, 
 
 from wm_nodes.recording.bag import Bag
 from wm_nodes.recording.errors import BagError
+from wm_nodes.recording.messages import NS_PER_S
 
-NS_PER_S = 1_000_000_000
 CLOCK_PERIOD_S = 0.025
 """The clock ticks at least this often while playing, s of wall time; a loop begins again at most this often."""
 
@@ -27,10 +27,6 @@ LONG_WAIT_S = 5.0
 STATIC_TRANSFORMS = "/tf_static"
 Publish = Callable[[str, bytes], None]
 Say = Callable[[str], None]
-
-
-def _say_nothing(text: str) -> None:
-    """Where nobody wants to hear."""
 
 
 class Playback:
@@ -135,7 +131,7 @@ class Playback:
 
     def run(
         self, publish: Publish, tick: Callable[[int], None], check: Callable[[], None] = lambda: None,
-        say: Say = _say_nothing,
+        say: Say = lambda text: None,
     ) -> None:
         """Play to the end, or until stop(), or until check() raises.
 
@@ -228,6 +224,11 @@ class Playback:
             if self._seek_ns is None:
                 self._seek_ns = self.start_ns
 
+    def _now_ns(self) -> int:
+        """The bag's time now, while it plays."""
+        began_s, began_ns = self._anchor
+        return began_ns + round((time.monotonic() - began_s) * self._rate * NS_PER_S)
+
     def _wait_for(self, time_ns: int, tick: Callable[[int], None], check: Callable[[], None], say: Say) -> bool:
         """Wait until a message is due; False: play from elsewhere, or not at all."""
         is_said = False
@@ -239,8 +240,7 @@ class Playback:
                 if self._paused and not self._steps:
                     self._condition.wait(CLOCK_PERIOD_S)
                     continue
-                began_s, began_ns = self._anchor
-                now_ns = began_ns + round((time.monotonic() - began_s) * self._rate * NS_PER_S)
+                now_ns = self._now_ns()
                 if self._paused or now_ns >= time_ns:
                     return True
                 wait_s = (time_ns - now_ns) / NS_PER_S / self._rate
@@ -248,9 +248,7 @@ class Playback:
                 self._condition.wait(min(CLOCK_PERIOD_S, wait_s))
                 if self._paused or self._seek_ns is not None:
                     continue
-                began_s, began_ns = self._anchor
-                now_ns = began_ns + round((time.monotonic() - began_s) * self._rate * NS_PER_S)
-                self._position_ns = min(time_ns, max(self._position_ns, now_ns))
+                self._position_ns = min(time_ns, max(self._position_ns, self._now_ns()))
                 position_ns = self._position_ns
             if wait_s > LONG_WAIT_S and not is_said:
                 is_said = True

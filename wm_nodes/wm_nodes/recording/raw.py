@@ -3,7 +3,7 @@
 import os
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from io import BufferedWriter
 from pathlib import Path
 
@@ -15,6 +15,8 @@ from wm_nodes.recording.metadata import FileInfo, TopicInfo, metadata_text, qos_
 from wm_nodes.recording.typestore import is_known, message_definition, recorded_hash, type_hash
 
 PARTIAL_SUFFIX = ".partial"
+FLUSH_S = 0.5
+"""Age at which a chunk is closed."""
 START_RECORD = "wm.start"
 """MCAP metadata record at the start of every file: the custom data known then, so that a kill does not lose them."""
 
@@ -22,7 +24,7 @@ START_RECORD = "wm.start"
 class RawBagWriter:
     """Writes CDR bytes into `path`, a rosbag2 folder. While open it is `<path>.partial`; close() completes and renames.
 
-    A chunk is closed when it holds `chunk_bytes`, or when `flush()` finds it older than `flush_s`: a kill loses at most
+    A chunk is closed when it holds `chunk_bytes`, or when `flush()` finds it older than FLUSH_S: a kill loses at most
     what came after that, and wm_nodes.recording.recover brings back the rest. A new file starts at `split_bytes`, and
     after `split_s` seconds (0: never). discard_partial: throw away what a killed process left under this name.
 
@@ -32,9 +34,8 @@ class RawBagWriter:
     """
 
     def __init__(
-        self, path: Path, *, custom: Mapping[str, str] | None = None, chunk_bytes: int = 2**20, flush_s: float = 0.5,
+        self, path: Path, *, custom: Mapping[str, str] | None = None, chunk_bytes: int = 2**20,
         split_bytes: int = 2**28, split_s: float = 0.0, discard_partial: bool = False,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.path = Path(path)
         self.partial_path = self.path.with_name(self.path.name + PARTIAL_SUFFIX)
@@ -52,11 +53,11 @@ class RawBagWriter:
         self._topics: dict[str, TopicInfo] = {}
         self._channels: dict[str, int] = {}
         self._definitions: dict[str, tuple[str, str]] = {}  # by type: encoding and text
-        self._chunk_bytes, self._flush_s = chunk_bytes, flush_s
-        self._split_bytes, self._split_s, self._clock = split_bytes, split_s, clock
+        self._chunk_bytes = chunk_bytes
+        self._split_bytes, self._split_s = split_bytes, split_s
         self._writer: Writer | None = None
         self._stream: BufferedWriter | None = None
-        self._file_started = self._last_flush = clock()
+        self._file_started = self._last_flush = time.monotonic()
         self._unflushed = 0
         try:
             self.partial_path.mkdir(parents=True)
@@ -131,16 +132,16 @@ class RawBagWriter:
         self._topics[topic].messages += 1
         self.files[-1].count(topic, time_ns)
         self.flush(only_if_due=True)
-        if 0 < self._split_bytes <= self.bytes_in_file or 0 < self._split_s <= self._clock() - self._file_started:
+        if 0 < self._split_bytes <= self.bytes_in_file or 0 < self._split_s <= time.monotonic() - self._file_started:
             self.split()
 
     def flush(self, *, only_if_due: bool = False) -> None:
-        """Hand everything written so far to the operating system; with only_if_due, at most every flush_s seconds.
+        """Hand everything written so far to the operating system; with only_if_due, at most every FLUSH_S.
 
         A recorder calls it from a timer too, so that the last messages before a silence survive a kill.
         """
-        now = self._clock()
-        if only_if_due and now - self._last_flush < self._flush_s:
+        now = time.monotonic()
+        if only_if_due and now - self._last_flush < FLUSH_S:
             return
         self._last_flush = now
         if self._unflushed:
@@ -216,7 +217,7 @@ class RawBagWriter:
         self._writer.add_metadata(START_RECORD, self.custom)
         self._stream.flush()
         self.files.append(FileInfo(name))
-        self._file_started = self._last_flush = self._clock()
+        self._file_started = self._last_flush = time.monotonic()
         self._channels = {}
         self._schemas: dict[str, int] = {}
         for topic in self._topics.values():

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from wm_nodes.core.lockstep import LockStep
-from wm_nodes.core.specs import POLICY_FIELDS, EnvironmentSpec
+from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Rollout
 from wm_nodes.recording import topics
 from wm_nodes.recording.bag import Bag
@@ -34,7 +34,7 @@ def read_rollouts(
     with Bag(path) as bag:
         steps = LockSteps(bag, namespace=namespace)
         if expected is not None:
-            check_spec(steps.spec, expected, where=str(path), names=POLICY_FIELDS)
+            check_spec(steps.spec, expected, where=str(path))
         if not bag.count(topics.absolute(steps.namespace, topics.REWARD)):
             raise BagError(f"bag {path} has no rewards; record the topic {topics.REWARD.name}, or re-evaluate them")
         for group in _rollout_groups(steps):

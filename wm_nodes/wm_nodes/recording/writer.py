@@ -18,6 +18,7 @@ Its step_id is that of the last step before it: it answers no StepBatch request.
 import json
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,7 @@ class EpisodeBagWriter:
         namespace: str = topics.DEFAULT_NAMESPACE, reward_name: str = "recorded", split_bytes: int = 2**28,
         start_ns: int | None = None, discard_partial: bool = False,
     ) -> None:
-        self.spec = m.single(spec)
+        self.spec = replace(spec, num_envs=1)
         self.path = Path(path)
         self.num_episodes = 0
         self._now_ns = time.time_ns() if start_ns is None else start_ns

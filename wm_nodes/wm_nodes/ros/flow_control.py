@@ -6,7 +6,8 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from wm_msgs.msg import Credit
-from wm_nodes.ros.qos import CREDIT_WINDOW, topic
+from wm_nodes.recording.topics import CREDIT_WINDOW
+from wm_nodes.ros.qos import topic
 from wm_nodes.ros.sequence_numbers import MAX_NUMBER, GapTracker
 
 SILENT_S = 5.0
@@ -78,7 +79,7 @@ class ConsumerCredits:
 
     def record_consumed(self, tracker: GapTracker) -> None:
         """Note that one message of the stream was dealt with; `tracker` has already observed it."""
-        first = self._tracker is None or tracker.sessions == 0 or tracker.received <= 1
+        first = self._tracker is None or tracker.received <= 1
         self._tracker = tracker
         self._since_grant += 1
         if first or self._since_grant >= self._window // 4:

@@ -50,15 +50,13 @@ class PeerWatch:
         self._identities: dict[str, str] = {}
         self._checked: float | None = None
 
-    def heard(self, name: str, now: float | None = None, identity: str = "") -> bool:
-        """Note a sign of life of a process; return whether the peer is new or had been lost."""
+    def heard(self, name: str, now: float | None = None, identity: str = "") -> None:
+        """Note a sign of life of a process."""
         if name == self._own_name:
-            return False
+            return
         self._identities[name] = identity
-        returned = name in self._lost or name not in self._heard
         self._lost.discard(name)
         self._heard[name] = time.monotonic() if now is None else now
-        return returned
 
     def left(self, name: str) -> None:
         """A peer said that it stops: its silence is no loss."""
@@ -104,10 +102,6 @@ class PeerWatch:
     @property
     def lost(self) -> list[str]:
         return sorted(self._lost)
-
-    @property
-    def present(self) -> list[str]:
-        return sorted(set(self._heard) - self._lost)
 
 
 class Heartbeat:
@@ -173,11 +167,10 @@ class Heartbeat:
         else:
             if not peers.knows(name):
                 check_sender(node, topic_name, name)
-            lost, silent_s = peers.is_lost(name), peers.silence_s(name)
-            if peers.heard(name, identity=message.detail):
+            if peers.is_lost(name):
                 node.diagnostics.clear_condition(f"peer {name}")
-            if lost:
-                node.get_logger().info(f"{name} is back after {silent_s:.1f} s")
+                node.get_logger().info(f"{name} is back after {peers.silence_s(name):.1f} s")
+            peers.heard(name, identity=message.detail)
 
     def _check_name(self, message: RunState) -> None:
         """End this node where another one of its name was there before: both would answer the same services.

@@ -39,8 +39,6 @@ try:
 except ImportError:  # ROS 2 from apt has it, and the set-up builds it; other environments may lack it
     TFMessage = None
 
-CREDIT_WINDOW = recorded.CREDIT_WINDOW
-
 WRITTEN_BY_EVERY_NODE = ("run/state", "run/links")
 EVERY_NODE_DEPTH = 64
 """More nodes than a graph has, so that a reader that was busy finds the newest word of each."""

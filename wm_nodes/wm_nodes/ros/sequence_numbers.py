@@ -54,12 +54,8 @@ class GapTracker:
     """Messages of all sessions."""
     lost: int = 0
     """Over all sessions."""
-    repeated: int = 0
-    """Messages that were not newer than one before."""
     jumps: int = 0
     """Forward by more than MAX_GAP; one is believed when the next message goes on from there."""
-    sessions: int = 0
-    """How many were seen."""
     gaps: list[tuple[int, int, int]] = field(default_factory=list)
     """(session, first missing seq, number of missing seqs), newest last; at most 1000 kept."""
     _last_seqs: dict[int, int] = field(default_factory=dict, repr=False)
@@ -73,7 +69,6 @@ class GapTracker:
         if session not in self._last_seqs:
             joined_late = not self._last_seqs or session < min(self._last_seqs)
             self._last_seqs[session] = seq - 1 if joined_late else -1
-            self.sessions += 1
             if len(self._last_seqs) > SESSIONS_KEPT:
                 del self._last_seqs[next(iter(self._last_seqs))]
         self._last_seqs[session] = self._last_seqs.pop(session)  # the newest last, so that it stays longest
@@ -86,7 +81,6 @@ class GapTracker:
                 return 0
             missing = 0
         elif missing < 0:
-            self.repeated += 1
             return 0
         if missing:
             self.lost += missing

@@ -7,6 +7,7 @@ import gc
 import logging
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
@@ -24,14 +25,13 @@ from rclpy.signals import SignalHandlerOptions
 
 from wm_nodes.config.load import ConfigError, read_yaml
 from wm_nodes.core.memory import keep_freed_memory, limit_memory
+from wm_nodes.ros.guard import LOG_PERIOD_S
 from wm_nodes.ros.middleware import set_node_defaults
 
-EXECUTORS = ("events", "single", "multi")
 SPIN_ONCE_S = 0.1
 """Longest wait inside one spin_once; a signal is seen after at most this long."""
 
 NO_MEMORY = "dropped what asked for more memory than there is, or than memory_limit_gib allows"
-LOG_PERIOD_S = 60.0
 _LOGGER = get_logger("spin")
 
 ANSWER_S = 0.3
@@ -82,13 +82,8 @@ def _dropping() -> Iterator[None]:
 
 
 def make_executor(kind: str) -> Executor:
-    """Return an executor by name; falls back to `single`, with a warning, where rclpy has no events executor.
-
-    Raises:
-        ValueError: for a name that is not in EXECUTORS.
-    """
-    if kind not in EXECUTORS:
-        raise ValueError(f"executor must be one of {', '.join(EXECUTORS)}, got {kind!r}")
+    """Return an executor by its name in ros/params.py; falls back to `single`, with a warning, where rclpy has no
+    events executor."""
     if kind == "multi":
         return _MultiThreaded(num_threads=2)
     if kind == "events":
@@ -166,8 +161,6 @@ def _mark_failed(nodes: list[Any]) -> Iterator[None]:
 
 def _limit_memory(nodes: list[Any]) -> None:
     """As the first node's parameter says, and before anybody asks: 48 bytes can claim to be a list of gigabytes."""
-    if not nodes[0].has_parameter("memory_limit_gib"):
-        return
     device, file = "auto", Path(str(nodes[0].get_parameter("config_file").value))
     with suppress(ConfigError):  # which configure tells
         device = str(read_yaml(file).get("device", device)) if file.is_file() else device
@@ -200,6 +193,22 @@ def destroy(executor: Executor, nodes: Iterable[Any]) -> None:
     executor.shutdown()
 
 
+@contextmanager
+def spinning(node: Node) -> Iterator[None]:
+    """Spin a node in a thread of its own; at the end destroy it, and shut rclpy down."""
+    executor, ended = make_executor("events"), threading.Event()
+    executor.add_node(node)
+    thread = threading.Thread(target=spin, args=(executor, ended.is_set), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        destroy(executor, [node])
+        rclpy.try_shutdown()
+
+
 def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = None) -> int:
     """Create nodes, start them, spin until a signal, stop them, shut down. Return the exit code.
 
@@ -218,7 +227,7 @@ def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = 
         with stop_on_signals() as stopped:
             nodes = list(make_nodes())
             _limit_memory(nodes)
-            executor = make_executor(executor_kind(nodes[0]))
+            executor = make_executor(str(nodes[0].get_parameter("executor").value))
             for node in nodes:
                 executor.add_node(node)
             with _mark_failed(nodes):
@@ -259,10 +268,6 @@ def init(args: list[str] | None = None) -> None:
         raise ValueError(f"ROS arguments refused: {str(error).splitlines()[0].partition(', at /')[0]}") from None
 
 
-def run_node(make_node: Callable[[], Any], args: list[str] | None = None) -> int:
+def run_node(make_node: Callable[[], Any]) -> int:
     """run_nodes for one node; `sys.exit(run_node(MyNode))` is a node's main."""
-    return run_nodes(lambda: [make_node()], args)
-
-
-def executor_kind(node: Node) -> str:
-    return str(node.get_parameter("executor").value) if node.has_parameter("executor") else "events"
+    return run_nodes(lambda: [make_node()])

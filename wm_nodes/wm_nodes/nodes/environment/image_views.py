@@ -1,7 +1,6 @@
 """What people watch of an environment: one of N alone, and the mosaic as JPEG. Nothing is made that nobody looks at."""
 
 import time
-from typing import Any
 
 import cv2
 import numpy as np
@@ -49,22 +48,19 @@ class ImageViews:
     def show(self, images: UInt8Array, mosaic: Image) -> None:
         """Publish what is due. images: uint8 (N, H, W, 3); mosaic: the env/image message of the same observation."""
         if self._view.get_subscription_count():
-            shown = int(self._param("view_env"))
+            shown = int(self._node.param("view_env"))
             if 0 <= shown < len(images) and self._due("view"):
                 message = convert.image_msg(images[shown], 0, mosaic.encoding)
                 message.header = mosaic.header
                 self._view.publish(message)
-        when = self._param("compressed")
+        when = self._node.param("compressed")
         wanted = when == "always" or (when == "subscribed" and self._compressed.get_subscription_count())
         if wanted and self._due("compressed"):
-            self._compressed.publish(jpeg_msg(mosaic, int(self._param("compressed_quality"))))
+            self._compressed.publish(jpeg_msg(mosaic, int(self._node.param("compressed_quality"))))
 
     def _due(self, view: str) -> bool:
         now = time.monotonic()
-        due = now - self._last_s.get(view, -1e9) >= float(self._param(f"{view}_period_s"))
+        due = now - self._last_s.get(view, -1e9) >= float(self._node.param(f"{view}_period_s"))
         if due:
             self._last_s[view] = now
         return due
-
-    def _param(self, name: str) -> Any:
-        return self._node.param(name)

@@ -78,13 +78,12 @@ class LockstepEnvironment:
         environment: what is stepped.
         session: of the serving node; a command of another session is refused.
         sink: gets every published item.
-        behaviour: label of the episode events until a reset names another.
         seed: root of the resets that name no seeds (stream `reset`, number of the draw).
         clock: gives the stamp of an observation, ns; every call a later one.
     """
 
     def __init__(
-        self, environment: Environment, session: int, sink: Sink, behaviour: str = "policy", seed: int = 0,
+        self, environment: Environment, session: int, sink: Sink, seed: int = 0,
         clock: Callable[[], int] | None = None,
     ) -> None:
         self.environment, self.session = environment, session
@@ -100,9 +99,7 @@ class LockstepEnvironment:
         self._last_step_id = 0
         self._last_reply: Reply | WireError | None = None
         self._current: Observation | None = None
-        self._episodes = RunningEpisodes(
-            self.spec.num_envs, self.spec.max_episode_steps, behaviour, lambda note: sink.episode(note)
-        )
+        self._episodes = RunningEpisodes(self.spec.num_envs, self.spec.max_episode_steps, sink.episode)
 
     @property
     def next_step_id(self) -> int:

@@ -3,20 +3,17 @@
 Shapes: N environments, A action.
 """
 
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import rclpy
 from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
 
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 from wm_nodes.ros.clients import Check, EnvironmentClient, RosEnvironmentClient
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.spin import make_executor, spin
+from wm_nodes.ros.spin import init, spinning
 from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand
 
 
@@ -87,21 +84,11 @@ def remote_environments(
     name: str, run_dir: Path, prefixes: Sequence[str], check: Check, *, timeout_s: float
 ) -> Iterator[list[RemoteEnvironment]]:
     """Environment nodes below /wm, stepped from a node `name` of this process; its executor has a thread of its own."""
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    init([])
     node = ManagedNode(name, namespace="/wm", parameter_overrides=[Parameter("run_dir", value=str(run_dir))])
-    executor = make_executor("events")
-    executor.add_node(node)
-    stop = threading.Event()
-    thread = threading.Thread(target=spin, args=(executor, stop.is_set), daemon=True)
-    thread.start()
-    try:
-        clients = [RosEnvironmentClient(node, prefix, timeout_s) for prefix in prefixes]
-        yield [RemoteEnvironment(client, check, timeout_s=timeout_s, behaviour=name) for client in clients]
-    finally:
-        node.stop()
-        stop.set()
-        thread.join()
-        executor.remove_node(node)
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown()
+    with spinning(node):
+        try:
+            clients = [RosEnvironmentClient(node, prefix, timeout_s) for prefix in prefixes]
+            yield [RemoteEnvironment(client, check, timeout_s=timeout_s, behaviour=name) for client in clients]
+        finally:
+            node.stop()

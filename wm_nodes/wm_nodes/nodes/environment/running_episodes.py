@@ -34,16 +34,13 @@ class _Slot:
 class RunningEpisodes:
     """Follows the episodes of N environments.
 
-    behaviour: label of the notes.
-
     Args:
         note: gets every begin and end.
     """
 
-    def __init__(
-        self, num_envs: int, max_episode_steps: int, behaviour: str, note: Callable[[EpisodeNote], None]
-    ) -> None:
-        self.behaviour = behaviour
+    def __init__(self, num_envs: int, max_episode_steps: int, note: Callable[[EpisodeNote], None]) -> None:
+        self.behaviour = "policy"
+        """Label of the notes, until a reset names another."""
         self._max_steps, self._send = max_episode_steps, note
         self._slots = [_Slot() for _ in range(num_envs)]
 

@@ -8,14 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from wm_msgs.msg import PolicyVersion
-from wm_nodes.core.errors import WireError
 from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.ros import convert
 from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import COMMON, Param, read_parameters
 from wm_nodes.ros.spin import run_node
-from wm_nodes.ros.wire import PeerLost
 from wm_nodes.ros.worker import Work
 from wm_nodes.training.ranks import Ranks, join
 from wm_nodes.training.run_folder import TrainingRun
@@ -26,8 +24,7 @@ class TrainingNode(ManagedNode):
     """A learner: trains by an action and announces every version of its run folder.
 
     A subclass calls hold_run_folder() in configure(), makes the run and calls serve_training(); it says in train() how
-    a goal is trained and in fill() what a result holds. The Result of the action has the reasons FINISHED, FAILED,
-    PEER_LOST, PAUSED.
+    a goal is trained and in fill() what a result holds. The Result of the action has the reason PAUSED, too.
 
     Args:
         ranks: this process is rank 0 of them.
@@ -39,11 +36,10 @@ class TrainingNode(ManagedNode):
     def __init__(self, params: Sequence[Param], ranks: Ranks | None = None, **node_arguments: Any) -> None:
         super().__init__("learner", params, **node_arguments)
         self.ranks = ranks or Ranks()
-        self._run: TrainingRun | None = None
 
     @abstractmethod
     def train(self, work: Work, result: Any) -> None:
-        """Train as the goal asks; what it raises becomes the result's reason and message."""
+        """Train as the goal asks. What it raises ends the goal as WorkerAction says; TrainingPaused with PAUSED."""
 
     @abstractmethod
     def fill(self, result: Any) -> Any:
@@ -72,7 +68,6 @@ class TrainingNode(ManagedNode):
     def announce(self) -> None:
         """Publish the newest version; its files are written first. Raises OSError."""
         run = self._run
-        assert run is not None  # serve_training sets it
         run.ensure_saved()
         packed = run.weights_of(run.version)
         message = PolicyVersion(
@@ -85,23 +80,17 @@ class TrainingNode(ManagedNode):
         self._versions.publish(message)
 
     def _train_goal(self, work: Work, result: Any) -> None:
-        reasons, run = type(result), self._run
-        assert run is not None  # serve_training sets it
+        self.announce()  # again: others may have heard of another one since, or its files were not written
         try:
-            self.announce()  # again: others may have heard of another one since, or its files were not written
             self.train(work, result)
-        except PeerLost as error:
-            result.termination_reason, result.message = reasons.PEER_LOST, str(error)
         except TrainingPaused as pause:
-            result.termination_reason, result.message = reasons.PAUSED, str(pause)
-        except (WireError, ValueError, OSError, FloatingPointError) as error:
-            result.termination_reason, result.message = reasons.FAILED, str(error)
-        if result.termination_reason in (reasons.PEER_LOST, reasons.FAILED, reasons.PAUSED):
+            result.termination_reason, result.message = type(result).PAUSED, str(pause)
             self.say_failed_goal(f"training ended: {result.message}")
-        elif result.message:
+            return
+        if result.message:
             self.get_logger().warning(f"training ended: {result.message}")
         else:
-            self.get_logger().info(f"training ended after update {run.updates}")
+            self.get_logger().info(f"training ended after update {self._run.updates}")
 
 
 def run_learner(

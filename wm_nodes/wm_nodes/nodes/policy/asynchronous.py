@@ -148,7 +148,7 @@ class AsynchronousPolicy:
             return
         noise = None
         if not self._node.param("deterministic"):
-            shape = (len(observation.states), self._holder.action_dim)
+            shape = (len(observation.states), self._holder.policy.action_dim)
             noise = np.random.default_rng().standard_normal(shape, np.float32)
         began = time.perf_counter()
         output, version = self._holder.act(observation.images, observation.states, noise)

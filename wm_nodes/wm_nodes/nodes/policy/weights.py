@@ -17,23 +17,11 @@ class PolicyHolder:
     """Thread-safe. version: the learner step of the weights that act; 0 before any."""
 
     def __init__(self, policy: ImagePolicy) -> None:
-        self._policy = policy
+        self.policy = policy
         self._lock = threading.Lock()
         self._arch_hash = arch_hash(policy.state_dict())
         self.version = 0
         self.sha256 = ""
-
-    @property
-    def state_dim(self) -> int:
-        return self._policy.state_dim
-
-    @property
-    def action_dim(self) -> int:
-        return self._policy.action_dim
-
-    @property
-    def policy(self) -> ImagePolicy:
-        return self._policy
 
     def act(self, images: UInt8Array, states: FloatArray, noise: FloatArray | None) -> tuple[PolicyOutput, int]:
         """Return actions for (N, H, W, 3) images and (N, S) states, and the version that chose them.
@@ -41,8 +29,8 @@ class PolicyHolder:
         Raises:
             DeviceError: too little memory for so many environments.
         """
-        with self._lock, explain_memory(self._policy.device, ppo__num_envs=len(images)):
-            return self._policy.act(images, states, noise=noise), self.version
+        with self._lock, explain_memory(self.policy.device, ppo__num_envs=len(images)):
+            return self.policy.act(images, states, noise=noise), self.version
 
     def follow(self, message: PolicyVersion, files: NamedFiles) -> bool:
         """Load an announced version; return False for the one already loaded. The old weights stay on an error.
@@ -60,23 +48,18 @@ class PolicyHolder:
                 f"policy version {message.version} has architecture {message.arch_hash[:12]}, this node's policy "
                 f"{self._arch_hash[:12]}; start both with the same config_file and model_dir",
             )
-        self.load(self._bytes(message, files), message.version, message.sha256)
+        inline = bytes(message.inline_data)
+        self.load(inline or read_weights(message.uri, files), message.version, message.sha256)
         return True
 
     def load(self, data: bytes, version: int, sha256: str = "") -> None:
         """Take over safetensors bytes. Raises WireError(HASH_MISMATCH); the old weights stay."""
         try:
             with self._lock:
-                load_weights(self._policy, data, sha256=sha256 or None)
+                load_weights(self.policy, data, sha256=sha256 or None)
                 self.version, self.sha256 = version, sha256
         except WeightsError as error:
             raise WireError(ErrorCode.HASH_MISMATCH, f"policy version {version} refused: {error}") from None
-
-    @staticmethod
-    def _bytes(message: PolicyVersion, files: NamedFiles) -> bytes:
-        if len(message.inline_data):
-            return bytes(message.inline_data)
-        return read_weights(message.uri, files)
 
 
 def load_initial(policy: ImagePolicy, name: str) -> None:

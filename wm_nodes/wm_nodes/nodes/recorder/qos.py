@@ -7,7 +7,7 @@ from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
-NS_PER_S = 1_000_000_000
+from wm_nodes.recording.messages import NS_PER_S
 
 
 def recorded_qos(profile: QoSProfile) -> Qos:

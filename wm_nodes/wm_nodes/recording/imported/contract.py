@@ -12,7 +12,7 @@ from wm_nodes.config.sections import NonNegativeInt, PositiveFloat, PositiveInt,
 from wm_nodes.core.specs import TARGET, TASK_PREFIX
 
 BOOL, STRING = "std_msgs/msg/Bool", "std_msgs/msg/String"
-IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+IMAGE = "sensor_msgs/msg/Image"
 Clock = Literal["header", "receive"]
 
 
