@@ -24,7 +24,7 @@ from benchmarks.tables.table import Rows, Run, interval, read
 from benchmarks.video_rl.comparison import paired_interval
 from wm_nodes.config.scenes import splits
 
-REWARDS, TRAINED = "roboscape_rewards.json", "roboscape_table1.json"
+REWARDS, TRAINED = "roboscape_rewards.json", ("roboscape_table1.json", "roboscape_more.json")
 DOMAINS = "IND", "OOD"
 POSITIONS = "positions"
 OURS = "reach_object"
@@ -36,17 +36,18 @@ PAYS = {
 }
 
 
-def trained(rows: Sequence[Run], training: str, task: str, inputs: str = POSITIONS) -> list[Run]:
-    """Those of the rows of Table 1, by seed. inputs: policy.inputs."""
-    wanted = training, task, inputs
-    found = [row for row in rows if (row["model"], row["task"], row["config"]["policy"]["inputs"]) == wanted]
-    return sorted(found, key=lambda row: int(row["seed"]))
+def trained(training: str, task: str, inputs: str = POSITIONS) -> list[Run]:
+    """Rows of Table 1, by seed; of a seed the first. inputs: policy.inputs."""
+    wanted, found = (training, task, inputs), dict[int, Run]()
+    for row in (row for file in TRAINED for row in read(file)["rows"]):
+        if (row["model"], row["task"], row["config"]["policy"]["inputs"]) == wanted:
+            found.setdefault(int(row["seed"]), row)
+    return [found[seed] for seed in sorted(found)]
 
 
 def table_1() -> Rows:
-    found = read(TRAINED)["rows"]
     for task, inputs, training in product((*TASKS, OURS), (POSITIONS, "latents"), (*TABLE_1, REFRESHED)):
-        if of := trained(found, training, task, inputs):
+        if of := trained(training, task, inputs):
             papers = (PAPER.get((training, domain)) if task in TASKS else None for domain in DOMAINS)
             yield (
                 task, f"{inputs}, {of[0]['config']['sft']['num_demonstrations']}", LABELS[training],
@@ -58,19 +59,17 @@ def table_1() -> Rows:
 
 
 def table_1_gains() -> Rows:
-    found = read(TRAINED)["rows"]
     for training, inputs, base, task in product(
         (MODEL, GOAL, REFRESHED), (POSITIONS, "latents"), (SFT, ONE_SCENE, ALL_SCENES), (*TASKS, OURS)
     ):
-        if text := gain([*trained(found, training, task, inputs), *trained(found, base, task, inputs)], base, training):
+        if text := gain([*trained(training, task, inputs), *trained(base, task, inputs)], base, training):
             yield task, inputs, PAYS[training], LABELS[base], text
 
 
 def figure_2() -> Rows:
-    found = read(TRAINED)["rows"]
-    base = {row["seed"]: success_of(row, "OOD") for row in trained(found, MODEL, "push")}
+    base = {row["seed"]: success_of(row, "OOD") for row in trained(MODEL, "push")}
     for training in FIGURE_2:
-        if of := trained(found, training, "push"):
+        if of := trained(training, "push"):
             differences = [success_of(row, "OOD") - base[row["seed"]] for row in of]
             apart = "" if training == MODEL else f"{fmean(differences):+.1f}"
             if apart and len(of) > 1:
