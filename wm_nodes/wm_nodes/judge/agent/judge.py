@@ -203,6 +203,23 @@ def reads_of(request: ReadRequest, cost: Cost, answer: Callable[[Component], Rea
     return [replace(reads[0], cost=cost), *reads[1:]] if reads else []
 
 
+class ForwardingJudge:
+    """A Judge that hands every question on to another one; a subclass overrides `read`."""
+
+    def __init__(self, judge: "Judge") -> None:
+        self._judge = judge
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return self._judge.capabilities
+
+    async def read(self, request: ReadRequest) -> list[Read]:
+        return await self._judge.read(request)
+
+    async def health(self) -> Health:
+        return await self._judge.health()
+
+
 class JudgeError(Exception):
     """No read of a request was answered, after the judge's own retries. cost: of the attempts."""
 
