@@ -26,12 +26,12 @@ from scripted_judge import (
     make_task,
 )
 
-from wm_nodes.judge.agent.judge import Read, ReadRequest
+from wm_nodes.judge.agent.judge import Cost, Read, ReadRequest
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.types import Status, clip_ref
 from wm_nodes.judge.agent.verdict import Verdict
-from wm_nodes.judge.audit.entries import plain
+from wm_nodes.judge.audit.entries import plain, typed
 from wm_nodes.judge.audit.log import FILE_NAME, AuditError, AuditLog, read_lines
 from wm_nodes.judge.audit.reading import Record, read_record, verify
 from wm_nodes.judge.audit.recording import AuditedAgent, write_exchange
@@ -62,6 +62,10 @@ def test_a_verdict_comes_out_of_the_log_bit_equal(tmp_path: Path, case: str, mod
         assert again.equal
         assert again.after is not None and again.after.audit_id == verdict.audit_id
     assert verify(tmp_path).problems == []
+
+
+def test_a_line_with_a_field_that_is_no_longer_written_is_read() -> None:
+    assert typed(Cost, {**plain(Cost(calls=2)), "usd": None}) == Cost(calls=2)
 
 
 def test_patterns_of_refused_clips_are_in_the_log_and_replayed(tmp_path: Path) -> None:

@@ -25,14 +25,10 @@ class Cost:
     """With waits and retries."""
     retries: int = 0
     """Requests beyond the first of each call."""
-    usd: float | None = None
-    """None where no price is known."""
 
     def __add__(self, other: "Cost") -> "Cost":
-        """Sum field by field; the usd of both where either is known."""
-        known = [cost.usd for cost in (self, other) if cost.usd is not None]
-        numbers = {f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self) if f.name != "usd"}
-        return Cost(**numbers, usd=sum(known) if known else None)
+        """Sum field by field."""
+        return Cost(**{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)})
 
 
 @dataclass(frozen=True)
@@ -176,8 +172,6 @@ class Capabilities:
     """Those it reads; None for all of the rubric."""
     max_frames: int = 64
     """Images per call."""
-    deterministic: bool = False
-    """Equal requests get equal answers."""
     card: str = ""
     """Its measured abilities as text; "" without a measurement."""
 

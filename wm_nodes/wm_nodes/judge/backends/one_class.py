@@ -106,7 +106,7 @@ class OneClassJudge:
     def capabilities(self) -> Capabilities:
         """What it reads, and who it is."""
         return Capabilities(
-            self.name, "embedded", f"one-class {self.sha256[:12]}", REVISION, KNOWN, deterministic=True, card=self.card
+            self.name, "embedded", f"one-class {self.sha256[:12]}", REVISION, KNOWN, card=self.card
         )
 
     @cached_property
