@@ -26,6 +26,7 @@ from scripted_judge import (
     make_task,
 )
 
+from wm_nodes.config.load import load_config
 from wm_nodes.judge.agent.judge import Cost, Read, ReadRequest
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
@@ -210,11 +211,13 @@ def test_prompts_and_raw_replies_of_a_server_are_kept_and_its_key_is_not(
 ) -> None:
     monkeypatch.setenv("JUDGE_API_KEY", "a-key-of-the-server")
 
+    settings = load_config("cpu", {"judge.repeat_share": 0.0}).judge
+
     async def run(server: ChatServer, folder: Path, cache: VerdictCache) -> Verdict:
         async with server.running():
             transport = ChatTransport([Endpoint(server.url, "judge", "JUDGE_API_KEY")], retry=RetryPolicy(2, 0, 0))
             with AuditLog(folder) as log:
-                judge = OpenAIJudge(transport, RUBRIC, cache=cache, on_exchange=partial(write_exchange, log))
+                judge = OpenAIJudge(transport, RUBRIC, settings, cache, partial(write_exchange, log))
                 verdict = await AuditedAgent(judge, RUBRIC, log, call_plan="pack").evaluate(*clips(1)[0])
             await transport.close()
             return verdict

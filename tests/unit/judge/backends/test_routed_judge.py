@@ -109,7 +109,7 @@ def test_a_server_that_can_do_it_is_asked_for_letters_only_and_for_their_probabi
     body = server.requests[-1]
     assert body["structured_outputs"] == {"choice": list("ABCDE")} and body["logprob_token_ids"] == ids
     wrong = JudgeConfig.model_validate({**load_config("base").judge.model_dump(), **values, "label_token_ids": [1, 2]})
-    with pytest.raises(ValueError, match=r"label_token_ids must hold 5 ids, of A to E, got \(1, 2\)"):
+    with pytest.raises(ValueError, match=r"judge.label_token_ids must hold 5 ids, of A to E, or none, got \[1, 2\]"):
         make_judge(wrong, RUBRIC)
 
 
