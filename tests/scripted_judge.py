@@ -73,7 +73,7 @@ class ScriptedJudge:
 
     @property
     def capabilities(self) -> Capabilities:
-        return Capabilities("scripted", "table", "none", "1", frozenset(self.table), deterministic=True)
+        return Capabilities("scripted", "table", "none", "1", frozenset(self.table))
 
     async def health(self) -> Health:
         return Health(True)

@@ -4,25 +4,18 @@ Calls are counted as a chat judge makes them in the plan `pack`: JSON votes of a
 per component.
 """
 
-from wm_nodes.judge.agent.judge import Capabilities, Health, Judge, Read, ReadRequest
+from wm_nodes.judge.agent.judge import ForwardingJudge, Judge, Read, ReadRequest
 
 
-class CountingJudge:
+class CountingJudge(ForwardingJudge):
     """A Judge that passes everything on, and counts calls and the images in them."""
 
     def __init__(self, judge: Judge) -> None:
-        self.judge = judge
+        super().__init__(judge)
         self.calls = self.images = 0
-
-    @property
-    def capabilities(self) -> Capabilities:
-        return self.judge.capabilities
 
     async def read(self, request: ReadRequest) -> list[Read]:
         calls = sum(1 if vote.kind == "json" else len(request.components) for vote in request.votes)
         self.calls += calls
         self.images += calls * len(request.media)
-        return await self.judge.read(request)
-
-    async def health(self) -> Health:
-        return await self.judge.health()
+        return await super().read(request)

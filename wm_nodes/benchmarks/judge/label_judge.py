@@ -80,7 +80,7 @@ class LabelJudge:
     def capabilities(self) -> Capabilities:
         model = f"labels {self._labels}, {self.errors}, seed {self._seed}"
         names = frozenset({*self._components, *self._patterns})
-        return Capabilities("labels", "none", model, "2", names, deterministic=True)
+        return Capabilities("labels", "none", model, "2", names)
 
     async def health(self) -> Health:
         return Health(True)

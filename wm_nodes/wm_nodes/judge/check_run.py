@@ -10,7 +10,7 @@ from typing import Literal
 
 from wm_nodes.config.judge import JudgeConfig
 from wm_nodes.core.device import CPU
-from wm_nodes.judge.agent.judge import Capabilities, Health, Judge, JudgeError, Read, ReadRequest
+from wm_nodes.judge.agent.judge import ForwardingJudge, Judge, JudgeError, Read, ReadRequest
 from wm_nodes.judge.agent.levels import first_vote, next_vote
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.profiles import profile_media
@@ -27,27 +27,21 @@ PROBED = 12
 """Clips about which the same is asked twice."""
 
 
-class KeepingJudge:
+class KeepingJudge(ForwardingJudge):
     """A Judge that passes everything on and keeps the reads."""
 
     def __init__(self, judge: Judge) -> None:
-        self._judge, self.reads, self.failures = judge, list[Read](), list[str]()
-
-    @property
-    def capabilities(self) -> Capabilities:
-        return self._judge.capabilities
+        super().__init__(judge)
+        self.reads, self.failures = list[Read](), list[str]()
 
     async def read(self, request: ReadRequest) -> list[Read]:
         try:
-            reads = await self._judge.read(request)
+            reads = await super().read(request)
         except JudgeError as error:
             self.failures.append(str(error))
             raise
         self.reads += reads
         return reads
-
-    async def health(self) -> Health:
-        return await self._judge.health()
 
 
 @dataclass(frozen=True)

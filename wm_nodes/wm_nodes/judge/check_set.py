@@ -21,7 +21,7 @@ from wm_nodes.core.named_files import CLIP_LIST, FileKind, read_regular
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import PLANNING, Stage
 from wm_nodes.judge.clip_files import read_job, read_list
-from wm_nodes.judge.decisions import OVERALL, STAGES
+from wm_nodes.judge.decisions import OVERALL, stage_labels
 from wm_nodes.judge.service import ClipJob
 
 CHECK_SET = PRETRAINED / "judge_check"
@@ -68,16 +68,10 @@ class ClipTruth(BaseModel):
         return self.family not in (CLEAN, BENIGN)
 
     def rows(self, rubric: Rubric) -> dict[str, bool | int | None]:
-        """The right decision of every row of Table 2 (decisions.py); None where nobody can tell.
-
-        A stage fails with any of its components, and is unknown only where none is known to fail.
-        """
+        """The right decision of every row of Table 2 (decisions.py); None where nobody can tell."""
         known: dict[str, bool | int | None] = {name: self.components.get(name) for name in rubric.component_names}
         known |= dict.fromkeys(rubric.stages[Stage.TC].components, self.completion >= PASSES_FROM)
-        for stage in (stage for stage in STAGES if stage in rubric.stages):
-            parts = [known[name] for name in rubric.stages[stage].components]
-            known[str(stage)] = False if False in parts else None if None in parts else True
-        return {**known, PLANNING: self.planning, OVERALL: self.success}
+        return {**known, **stage_labels(known, rubric), PLANNING: self.planning, OVERALL: self.success}
 
 
 @dataclass(frozen=True, eq=False)

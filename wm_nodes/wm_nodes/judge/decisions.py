@@ -5,6 +5,7 @@ passes, except TC, which passes from level 3 on, because its gate asks for visib
 every gate passed and the task is completed (RA-24): our choice, the paper does not define it.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from wm_nodes.judge.agent.rubric import Rubric
@@ -29,6 +30,20 @@ def row_names(rubric: Rubric) -> list[str]:
     for stage in (stage for stage in STAGES if stage in rubric.stages):
         names += [str(stage), *rubric.stages[stage].components]
     return [*names, *rubric.stages[Stage.TC].components, OVERALL]
+
+
+def stage_labels(components: Mapping[str, bool | int | None], rubric: Rubric) -> dict[str, bool | None]:
+    """Whether each stage passes by what is known of its components; stages of which nothing is known are left out.
+
+    A stage fails with any of its components, and is unknown (None) only where none is known to fail.
+    """
+    labels: dict[str, bool | None] = {}
+    for stage in (stage for stage in STAGES if stage in rubric.stages):
+        names = rubric.stages[stage].components
+        if any(name in components for name in names):
+            parts = [components.get(name) for name in names]
+            labels[str(stage)] = False if False in parts else None if None in parts else True
+    return labels
 
 
 def decisions_of(verdict: Verdict) -> dict[str, Decision]:

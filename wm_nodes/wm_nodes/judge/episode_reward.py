@@ -100,7 +100,7 @@ def check_agent(config: RunConfig, *, trains: bool = True) -> None:
     """
     check_judge(config.judge)
     load_rubric(config.judge.rubric)
-    spec = _scene(config)
+    spec = configured_spec(config)
     if trains:
         check_horizon(config.ppo.num_steps, spec.max_episode_steps)
     check_clips(for_task(config.judge, config.task), _longest_clip(spec), 1 / spec.control_period_s)
@@ -109,10 +109,6 @@ def check_agent(config: RunConfig, *, trains: bool = True) -> None:
 def episode_judge(config: RunConfig) -> JudgeConfig:
     """The judge's settings for episodes of the configured scene, see judge_or_embedded and for_task."""
     return for_task(judge_or_embedded(config.judge), config.task)
-
-
-def _scene(config: RunConfig) -> EnvironmentSpec:
-    return configured_spec(config)
 
 
 def _longest_clip(spec: EnvironmentSpec) -> tuple[int, ...]:

@@ -1,6 +1,5 @@
 """Judge the episodes of a recorded run again, without a graph, and compare with the recorded rewards bit by bit."""
 
-from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -41,7 +40,7 @@ def judge_bag(path: Path, judge: JudgeService, *, namespace: str | None = None) 
         BagError: an unusable bag.
     """
     judged, model = JudgedBag(), EpisodeReward(judge)
-    waiting = deque[tuple[LockStep, PendingReward]]()
+    waiting = list[tuple[LockStep, PendingReward]]()
     with Bag(path) as bag:
         steps = LockSteps(bag, namespace=namespace, reward_name=AGENT)
         session = None
@@ -51,8 +50,7 @@ def judge_bag(path: Path, judge: JudgeService, *, namespace: str | None = None) 
                 session = step.session
             if not step.is_reset and step.valid.any():
                 waiting.append((step, model.add(step, steps.spec)))
-    while waiting:
-        step, pending = waiting.popleft()
+    for step, pending in waiting:
         result = pending.result()
         judged.verdicts += pending.verdicts().values()
         judged.unseen += [reason for reason in pending.waited.values() if isinstance(reason, str)]

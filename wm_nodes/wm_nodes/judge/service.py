@@ -94,7 +94,7 @@ class _JudgeSlot:
     """One judge with its agent."""
 
     opened: OpenedJudge
-    agent: RewardAgent | AuditedAgent
+    agent: RewardAgent
 
     @property
     def judge_id(self) -> str:
@@ -261,15 +261,15 @@ class JudgeService:
     async def _judge_clip(self, job: ClipJob, deadline: float | None) -> Verdict:
         agent = self._slot_of(job.task.task_id).agent
         if job.problem:
-            verdict = _unjudged(agent, job, self._seed, job.problem)
+            verdict = _unjudged(agent, job, job.problem)
         elif refusal := self._refused.get(job.task.task_id):
-            verdict = _unjudged(agent, job, self._seed, refusal, Status.ABSTAIN)
+            verdict = _unjudged(agent, job, refusal, Status.ABSTAIN)
         else:
             verdict = await self._evaluate(agent, job, deadline)
         self.tally.add(verdict)
         return verdict
 
-    async def _evaluate(self, agent: RewardAgent | AuditedAgent, job: ClipJob, deadline: float | None) -> Verdict:
+    async def _evaluate(self, agent: RewardAgent, job: ClipJob, deadline: float | None) -> Verdict:
         left_s = None if deadline is None else deadline - time.monotonic()
         try:
             async with asyncio.timeout(left_s), self._semaphore:
@@ -277,7 +277,7 @@ class JudgeService:
                 evidence = {} if known is None else await asyncio.to_thread(known.evidence, job.clip, job.task)
                 return await agent.evaluate(job.clip, job.task, evidence)
         except TimeoutError:
-            return _unjudged(agent, job, self._seed, "no verdict by the round's deadline")
+            return _unjudged(agent, job, "no verdict by the round's deadline")
 
     async def _ask_health(self, slot: _JudgeSlot) -> None:
         self.health = await slot.opened.judge.health()
@@ -312,9 +312,7 @@ def _settings_by_task(
     return known or {"": settings}, refused
 
 
-def _unjudged(
-    agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int, reason: str, status: Status = Status.ERROR
-) -> Verdict:
+def _unjudged(agent: RewardAgent, job: ClipJob, reason: str, status: Status = Status.ERROR) -> Verdict:
     """The verdict on a clip that was not judged."""
     able, now = agent.judge.capabilities, time.time()
     verdict = Verdict(
@@ -322,7 +320,7 @@ def _unjudged(
         stages=tuple(map(skipped_stage, GATED)), plan=None, reflections=(), hack_flags=(), cost=Cost(),
         provenance=Provenance(
             able.judge_id, able.transport, able.model, able.server_version, agent.version, "", job.clip.sha256,
-            seed, now, now,
+            agent.seed, now, now,
         ),
         reason=reason,
     )

@@ -26,12 +26,13 @@ from scripted_judge import (
     make_task,
 )
 
-from wm_nodes.judge.agent.judge import Read, ReadRequest
+from wm_nodes.config.load import load_config
+from wm_nodes.judge.agent.judge import Cost, Read, ReadRequest
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.types import Status, clip_ref
 from wm_nodes.judge.agent.verdict import Verdict
-from wm_nodes.judge.audit.entries import plain
+from wm_nodes.judge.audit.entries import plain, typed
 from wm_nodes.judge.audit.log import FILE_NAME, AuditError, AuditLog, read_lines
 from wm_nodes.judge.audit.reading import Record, read_record, verify
 from wm_nodes.judge.audit.recording import AuditedAgent, write_exchange
@@ -62,6 +63,10 @@ def test_a_verdict_comes_out_of_the_log_bit_equal(tmp_path: Path, case: str, mod
         assert again.equal
         assert again.after is not None and again.after.audit_id == verdict.audit_id
     assert verify(tmp_path).problems == []
+
+
+def test_a_line_with_a_field_that_is_no_longer_written_is_read() -> None:
+    assert typed(Cost, {**plain(Cost(calls=2)), "usd": None}) == Cost(calls=2)
 
 
 def test_patterns_of_refused_clips_are_in_the_log_and_replayed(tmp_path: Path) -> None:
@@ -206,11 +211,13 @@ def test_prompts_and_raw_replies_of_a_server_are_kept_and_its_key_is_not(
 ) -> None:
     monkeypatch.setenv("JUDGE_API_KEY", "a-key-of-the-server")
 
+    settings = load_config("cpu", {"judge.repeat_share": 0.0}).judge
+
     async def run(server: ChatServer, folder: Path, cache: VerdictCache) -> Verdict:
         async with server.running():
             transport = ChatTransport([Endpoint(server.url, "judge", "JUDGE_API_KEY")], retry=RetryPolicy(2, 0, 0))
             with AuditLog(folder) as log:
-                judge = OpenAIJudge(transport, RUBRIC, cache=cache, on_exchange=partial(write_exchange, log))
+                judge = OpenAIJudge(transport, RUBRIC, settings, cache, partial(write_exchange, log))
                 verdict = await AuditedAgent(judge, RUBRIC, log, call_plan="pack").evaluate(*clips(1)[0])
             await transport.close()
             return verdict

@@ -16,6 +16,8 @@ import pytest
 from chat_server import ChatServer, Fault
 from scripted_judge import COOKING
 
+from wm_nodes.config.judge import JudgeConfig
+from wm_nodes.config.load import load_config
 from wm_nodes.judge import backends
 from wm_nodes.judge.agent.judge import ComponentScore, Cost, JudgeError, MediaItem, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.levels import first_vote, next_vote, option_order, state_of
@@ -25,7 +27,6 @@ from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.agent.types import PLANNING, Profile, Stage, Status, TaskSpec, clip_ref
 from wm_nodes.judge.agent.verdict import Verdict, content_hash
 from wm_nodes.judge.backends.cache import VerdictCache
-from wm_nodes.judge.backends.calls import ChatOptions
 from wm_nodes.judge.backends.labels import label_options, option_probabilities
 from wm_nodes.judge.backends.openai_client import OpenAIJudge
 from wm_nodes.judge.backends.plans import CallPlan
@@ -39,6 +40,11 @@ FRAMES = np.random.default_rng(0).integers(0, 256, (12, 8, 10, 3), np.uint8)
 CLIP = clip_ref("one", FRAMES, 8.0)
 TASK = TaskSpec("push the red cube", "push", "panda", FRAMES[0])
 JSON, LABEL = first_vote(3), next_vote(2, 3)
+
+
+def asked_by(**changes: Any) -> JudgeConfig:
+    """The settings of a judge that asks nothing twice."""
+    return load_config("cpu").judge.model_copy(update={"repeat_share": 0.0, **changes})
 
 
 def request(
@@ -63,7 +69,7 @@ def judging(
             retry = RetryPolicy(base_s=0.001, cap_s=0.002)
             transport = ChatTransport([Endpoint(server.url, model)], retry=retry, jitter=random.Random(0))
             try:
-                return await steps(OpenAIJudge(transport, **{"rubric": RUBRIC, **options}))
+                return await steps(OpenAIJudge(transport, **{"rubric": RUBRIC, "settings": asked_by(), **options}))
             finally:
                 await transport.close()
 
@@ -134,8 +140,8 @@ def test_images_are_lossless_png_with_a_label_before_each() -> None:
 
 
 def test_the_dense_profile_goes_as_one_video_where_the_settings_say_so() -> None:
-    server, options = ChatServer(), ChatOptions(video=True)
-    reads = reads_of(request(Stage.PC, ["geometry"], profile=Profile.D), server, options=options)
+    server, settings = ChatServer(), asked_by(video=True)
+    reads = reads_of(request(Stage.PC, ["geometry"], profile=Profile.D), server, settings=settings)
     labels, video = server.requests[0]["messages"][1]["content"][:2]
     media = profile_media(CLIP, TASK, Profile.D)
     assert labels["text"].endswith(", ".join(item.label for item in media))
@@ -145,9 +151,9 @@ def test_the_dense_profile_goes_as_one_video_where_the_settings_say_so() -> None
         pixels = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
         np.testing.assert_array_equal(pixels, FRAMES[item.index])
     assert reads[0].status is Status.OK and reads[0].cost.images == len(media)
-    reads_of(request(), server, options=options)
+    reads_of(request(), server, settings=settings)
     single = replace(request(Stage.PC, ["geometry"], profile=Profile.D), media=media[:1])
-    reads_of(single, server, options=options)
+    reads_of(single, server, settings=settings)
     for body in server.requests[1:]:  # still profiles, and a single cited frame
         assert {part["type"] for part in body["messages"][1]["content"]} == {"text", "image_url"}
 
@@ -350,7 +356,7 @@ def test_extra_fields_go_with_every_request_and_make_another_key(tmp_path: Path)
     asked, quiet = request(components=["clarity"], votes=[JSON, LABEL]), {"enable_thinking": False}
     for extra in ({}, {"chat_template_kwargs": quiet}, {"chat_template_kwargs": quiet, "temperature": 0.5}):
         server = ChatServer()
-        reads_of(asked, server, options=ChatOptions(extra_body=extra), cache=VerdictCache(tmp_path))
+        reads_of(asked, server, settings=asked_by(extra_body=extra), cache=VerdictCache(tmp_path))
         assert len(server.requests) == 2, "never from the cache of other fields"
         for body in server.requests:
             assert {name: body.get(name) for name in extra} == extra and body["max_tokens"] in (1, 1024)
@@ -405,7 +411,7 @@ def test_dead_server_is_a_judge_error_and_followers_are_not_sent() -> None:
 
 def test_budget_ends_the_calls_of_a_request() -> None:
     with pytest.raises(JudgeError, match="no answer within"):
-        reads_of(request(), ChatServer(delay_s=1), options=ChatOptions(budget_s=0.2))
+        reads_of(request(), ChatServer(delay_s=1), settings=asked_by(clip_budget_s=0.2))
 
 
 # Label reads
@@ -448,13 +454,14 @@ def test_low_label_mass_abstains_except_under_a_grammar() -> None:
     assert (read.status, read.levels) == (Status.ABSTAIN, ()) and read.label_mass == pytest.approx(0.3)
     assert "label mass 0.300 is below 0.5" in read.reason
     server = ChatServer(labels=labels)
-    options = ChatOptions(choice_grammar=True, label_token_ids=(65, 66, 67, 68, 69))
-    (read,) = reads_of(request(components=["clarity"], votes=[LABEL]), server, options=options)
+    settings = asked_by(choice_grammar=True, label_token_ids=[65, 66, 67, 68, 69])
+    (read,) = reads_of(request(components=["clarity"], votes=[LABEL]), server, settings=settings)
     assert (read.status, read.label_mass) == (Status.OK, 1.0)
     body = server.requests[0]
     assert body["structured_outputs"] == {"choice": list("ABCDE")} and body["logprob_token_ids"] == [65, 66, 67, 68, 69]
     assert "top_logprobs" not in body
-    (read,) = reads_of(request(components=["clarity"], votes=[LABEL]), ChatServer(labels={"the": 1.0}), options=options)
+    server = ChatServer(labels={"the": 1.0})
+    (read,) = reads_of(request(components=["clarity"], votes=[LABEL]), server, settings=settings)
     assert (read.status, read.levels) == (Status.ABSTAIN, ())
 
 
@@ -501,7 +508,7 @@ def test_whatever_changes_the_answer_changes_the_key(tmp_path: Path) -> None:
     assert [sent(asked), sent(asked)] == [1, 0]
     assert sent(asked, model="other") == 1
     assert sent(asked, rubric=load_rubric(overrides={"revision": 2})) == 1
-    assert sent(asked, options=ChatOptions(max_answer_tokens=512)) == 1
+    assert sent(asked, settings=asked_by(extra_body={"max_tokens": 512})) == 1
     assert sent(replace(asked, task=replace(TASK, instruction="pull"))) == 1
     assert sent(replace(asked, clip=clip_ref("one", FRAMES[:, ::-1], 8.0))) == 1
     assert sent(replace(asked, votes=(replace(JSON, seed=4),))) == 1
@@ -574,12 +581,12 @@ def test_repeated_calls_tell_how_often_the_server_contradicts_itself_and_the_fir
         return reads, dict((await judge.health()).details)
 
     server = Wavering()
-    reads, details = judging(steps, server, options=ChatOptions(repeat_share=1.0))
+    reads, details = judging(steps, server, settings=asked_by(repeat_share=1.0))
     assert [read.levels.index(1) for read in reads] == [3, 3] and len(server.requests) == 2
     assert (details["repeated"], details["flipped"], details["flip_rate"]) == (2, 2, 1)
     assert sum(read.cost.calls for read in reads) == 2
     steady = ChatServer()
-    _, details = judging(steps, steady, options=ChatOptions(repeat_share=1.0))
+    _, details = judging(steps, steady, settings=asked_by(repeat_share=1.0))
     assert details["flip_rate"] == 0 and len(steady.requests) == 2
     _, details = judging(steps, once := ChatServer())
     assert "flip_rate" not in details and len(once.requests) == 1
@@ -596,7 +603,7 @@ def test_health_tells_whether_the_model_is_served_and_what_was_measured() -> Non
     wrong = judging(steps, ChatServer(), model="qwen")
     assert not wrong.available and wrong.reason == "no endpoint serves qwen; served: judge"
     transport = ChatTransport([Endpoint("http://127.0.0.1:9/v1", "judge")])
-    assert not asyncio.run(OpenAIJudge(transport, RUBRIC).health()).available
+    assert not asyncio.run(OpenAIJudge(transport, RUBRIC, asked_by()).health()).available
 
 
 def test_bad_requests_and_settings_name_what_is_wrong() -> None:
@@ -610,10 +617,8 @@ def test_bad_requests_and_settings_name_what_is_wrong() -> None:
         with pytest.raises(ValueError, match=problem):
             reads_of(asked, server)
         assert not server.requests
-    with pytest.raises(ValueError, match="must hold 5 ids"):
-        ChatOptions(label_token_ids=(1, 2))
     with pytest.raises(ValueError, match="must serve one model, got a, b"):
-        OpenAIJudge(ChatTransport([Endpoint("http://x/v1", "a"), Endpoint("http://y/v1", "b")]), RUBRIC)
+        OpenAIJudge(ChatTransport([Endpoint("http://x/v1", "a"), Endpoint("http://y/v1", "b")]), RUBRIC, asked_by())
 
 
 def test_a_new_domains_component_is_asked_about_gated_and_capped_with_a_file_alone(tmp_path: Path) -> None:

@@ -20,13 +20,14 @@ from chat_server import Fault
 from fault_proxy import FaultProxy
 from tiny_vlm import save_tiny_vlm, transformers_serve
 
+from wm_nodes.config.judge import JudgeConfig
+from wm_nodes.config.load import load_config
 from wm_nodes.judge.agent.judge import JudgeError, ReadRequest
 from wm_nodes.judge.agent.levels import first_vote, next_vote
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.profiles import profile_media
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.agent.types import Profile, Stage, Status, TaskSpec, clip_ref
-from wm_nodes.judge.backends.calls import ChatOptions
 from wm_nodes.judge.backends.openai_client import OpenAIJudge
 from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy, TransportError
 
@@ -49,11 +50,16 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoint]:
         yield Endpoint(url, str(folder), max_in_flight=4)
 
 
+def settings(**changes: Any) -> JudgeConfig:
+    """Of a judge that asks nothing twice."""
+    return load_config("cpu").judge.model_copy(update={"repeat_share": 0.0, **changes})
+
+
 def with_judge(endpoint: Endpoint, steps: Callable[[OpenAIJudge, ChatTransport], Awaitable[Any]]) -> Any:
     async def run() -> Any:
         transport = ChatTransport([endpoint])
         try:
-            return await steps(OpenAIJudge(transport, load_rubric()), transport)
+            return await steps(OpenAIJudge(transport, load_rubric(), settings()), transport)
         finally:
             await transport.close()
 
@@ -74,7 +80,7 @@ def through_proxy(
         async with FaultProxy(endpoint.base_url, deque(faults)).running() as proxy:
             spoiled = replace(endpoint, base_url=proxy.url, max_in_flight=max_in_flight)
             transport = ChatTransport([spoiled], retry=RetryPolicy(base_s=0.01, cap_s=0.02), jitter=random.Random(0))
-            judge = OpenAIJudge(transport, load_rubric(), ChatOptions(json_timeout_s=timeout_s))
+            judge = OpenAIJudge(transport, load_rubric(), settings(json_timeout_s=timeout_s))
             try:
                 return await steps(judge, transport, proxy)
             finally:

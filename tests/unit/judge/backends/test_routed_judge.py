@@ -65,7 +65,7 @@ def test_other_routes_are_another_judge_and_the_order_of_stages_is_not() -> None
     assert ids[0] == ids[1] != ids[2] and ids[0].startswith("routed:")
     assert RoutedJudge(other, [([Stage.PC], first)], RUBRIC).capabilities.judge_id not in ids
     able = RoutedJudge(first, [(CONTACT, other)], RUBRIC).capabilities
-    assert able.model == "else: first; TC+PC: other" and able.max_frames == 8 and not able.deterministic
+    assert able.model == "else: first; TC+PC: other" and able.max_frames == 8
 
 
 class Named(ScriptedJudge):
@@ -77,7 +77,7 @@ class Named(ScriptedJudge):
     def capabilities(self) -> Capabilities:
         frames = {"first": 8, "other": 16}[self.name]
         components = frozenset(self.table)
-        return Capabilities(self.name, "table", self.name, "1", components, max_frames=frames, deterministic=frames < 9)
+        return Capabilities(self.name, "table", self.name, "1", components, max_frames=frames)
 
 
 def test_a_judge_may_know_its_own_stages_only_and_one_that_lacks_a_component_is_refused_by_name(tmp_path: Any) -> None:
@@ -109,7 +109,7 @@ def test_a_server_that_can_do_it_is_asked_for_letters_only_and_for_their_probabi
     body = server.requests[-1]
     assert body["structured_outputs"] == {"choice": list("ABCDE")} and body["logprob_token_ids"] == ids
     wrong = JudgeConfig.model_validate({**load_config("base").judge.model_dump(), **values, "label_token_ids": [1, 2]})
-    with pytest.raises(ValueError, match=r"label_token_ids must hold 5 ids, of A to E, got \(1, 2\)"):
+    with pytest.raises(ValueError, match=r"judge.label_token_ids must hold 5 ids, of A to E, or none, got \[1, 2\]"):
         make_judge(wrong, RUBRIC)
 
 

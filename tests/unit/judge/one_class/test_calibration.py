@@ -14,12 +14,13 @@ from wm_nodes.apps import cli
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Episode
-from wm_nodes.judge.backends.one_class import OneClassJudge
+from wm_nodes.judge.backends.one_class import ranges_of, unfit_reason
 from wm_nodes.judge.one_class import ranges as ranges_module
 from wm_nodes.judge.one_class.calibration import calibrate, done_at, harmless, words_of
 from wm_nodes.judge.one_class.ranges import NAMES, file_of, load_ranges
 from wm_nodes.recording.writer import EpisodeBagWriter
 from wm_nodes.world_model import WorldModels, load_model_folder
+from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.validation.open_loop import imagine
 
 FOLDER = shipped_model("push_cube")
@@ -74,7 +75,8 @@ def test_the_command_makes_a_judge_of_a_world_model(
     assert made.world_model == models().sha256 and "push_cube" in made.done
     assert made.story["recordings"] == EPISODES and made.story["clips"] == 4 * EPISODES
     assert "judge calibrate" in made.story["command"]
-    assert OneClassJudge(folder).unfit_reason((4, 64, 128, 3)) == ""
+    manifest = read_world_manifest(folder)
+    assert unfit_reason(ranges_of(folder, manifest), manifest, (4, 64, 128, 3)) == ""
 
 
 @pytest.mark.slow

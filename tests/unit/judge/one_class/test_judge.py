@@ -22,14 +22,17 @@ from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.agent.types import ClipRef, Profile, Stage, Status, TaskSpec, clip_ref
 from wm_nodes.judge.agent.verdict import Verdict
-from wm_nodes.judge.backends.factory import make_judge
-from wm_nodes.judge.backends.one_class import OneClassJudge
+from wm_nodes.judge.backends.factory import check_judge, make_judge
+from wm_nodes.judge.backends.one_class import OneClassJudge, ranges_of, unfit_reason
 from wm_nodes.judge.check_set import LabelledClip, load_check_set
 from wm_nodes.judge.one_class.calibration import words_of
 from wm_nodes.judge.one_class.pictures import HUES
 from wm_nodes.judge.one_class.ranges import KEPT, file_of, load_ranges, strides_of
+from wm_nodes.world_model.folder import read_world_manifest
 
 FOLDER = shipped_model("push_cube")
+MANIFEST = read_world_manifest(FOLDER)
+RANGES = ranges_of(FOLDER, MANIFEST)
 
 
 @functools.cache
@@ -128,11 +131,11 @@ def test_clips_of_another_size_length_or_reference_are_not_judged() -> None:
     ):
         verdict = judged(*of_frames(shown))
         assert verdict.status is Status.ABSTAIN and reason in verdict.reason and np.isnan(verdict.reward)
-        assert reason in judge().unfit_reason(shown.shape)
+        assert reason in unfit_reason(RANGES, MANIFEST, shown.shape)
     other = replace(clean().job.task, reference_frame=frames[0, :, :64])
     verdict = judged(clean().job.clip, other)
     assert verdict.status is Status.ABSTAIN and "the reference frame is 64 x 64 px" in verdict.reason
-    assert judge().unfit_reason(frames.shape) == ""
+    assert unfit_reason(RANGES, MANIFEST, frames.shape) == ""
 
 
 def test_clips_of_a_frame_rate_without_ranges_are_not_judged_and_of_a_near_one_they_are() -> None:
@@ -165,7 +168,7 @@ def test_between_both_limits_a_conformal_judge_abstains_and_is_another_judge() -
     assert all(sure.levels == careful.levels for sure, careful in answers if careful.status is Status.OK)
     assert judge(0.01).capabilities.judge_id == judge().capabilities.judge_id + "@0.01"
     with pytest.raises(ValueError, match=f"must be below {KEPT}, .* got 0.98"):
-        OneClassJudge(FOLDER, 0.98)
+        check_judge(load_config("cpu", {"judge.kind": "embedded", "judge.conformal": 0.98}).judge)
 
 
 @pytest.mark.parametrize("frames", [3, 9])

@@ -25,14 +25,10 @@ class Cost:
     """With waits and retries."""
     retries: int = 0
     """Requests beyond the first of each call."""
-    usd: float | None = None
-    """None where no price is known."""
 
     def __add__(self, other: "Cost") -> "Cost":
-        """Sum field by field; the usd of both where either is known."""
-        known = [cost.usd for cost in (self, other) if cost.usd is not None]
-        numbers = {f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self) if f.name != "usd"}
-        return Cost(**numbers, usd=sum(known) if known else None)
+        """Sum field by field."""
+        return Cost(**{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)})
 
 
 @dataclass(frozen=True)
@@ -176,8 +172,6 @@ class Capabilities:
     """Those it reads; None for all of the rubric."""
     max_frames: int = 64
     """Images per call."""
-    deterministic: bool = False
-    """Equal requests get equal answers."""
     card: str = ""
     """Its measured abilities as text; "" without a measurement."""
 
@@ -201,6 +195,23 @@ def reads_of(request: ReadRequest, cost: Cost, answer: Callable[[Component], Rea
         said = answer(name)
         reads += [replace(said, component=name, vote=vote, cost=Cost()) for vote in request.votes]
     return [replace(reads[0], cost=cost), *reads[1:]] if reads else []
+
+
+class ForwardingJudge:
+    """A Judge that hands every question on to another one; a subclass overrides `read`."""
+
+    def __init__(self, judge: "Judge") -> None:
+        self._judge = judge
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return self._judge.capabilities
+
+    async def read(self, request: ReadRequest) -> list[Read]:
+        return await self._judge.read(request)
+
+    async def health(self) -> Health:
+        return await self._judge.health()
 
 
 class JudgeError(Exception):

@@ -74,10 +74,6 @@ class ClipRef:
     source: Literal["rollout", "real", "adversarial"] = "rollout"
     """Where it comes from."""
 
-    @property
-    def duration_s(self) -> float:
-        return len(self.frames) / self.fps
-
 
 def clip_ref(
     clip_id: str, frames: UInt8Array, fps: float, source: Literal["rollout", "real", "adversarial"] = "rollout"

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from rich.table import Table
@@ -196,6 +195,5 @@ def _measure_reflection(clips: Sequence[LabelledEvaluation]) -> ReflectionEffect
 
 def _cost(clips: Sequence[LabelledEvaluation]) -> dict[str, float]:
     costs = [clip.evaluation.verdict.cost for clip in clips]
-    names: tuple[str, ...] = ("calls", "prompt_tokens", "cached_tokens", "completion_tokens", "images", "wall_s", "usd")
-    known: dict[str, list[Any]] = {name: [getattr(cost, name) for cost in costs] for name in names}
-    return {n: float(np.mean(v)) for n, v in known.items() if v and None not in v}
+    names = ("calls", "prompt_tokens", "cached_tokens", "completion_tokens", "images", "wall_s")
+    return {name: float(np.mean([getattr(cost, name) for cost in costs])) for name in names} if costs else {}

@@ -11,7 +11,7 @@ from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import NUM_LEVELS, NUM_PLAN_LEVELS, PLANNING
 from wm_nodes.judge.audit.log import AuditError
 from wm_nodes.judge.audit.reading import RecordedEvaluation
-from wm_nodes.judge.decisions import OVERALL, STAGES
+from wm_nodes.judge.decisions import OVERALL, stage_labels
 
 FORMAT = "audit-labels-1"
 HACK = "hack: "
@@ -75,7 +75,7 @@ def read_labels(path: Path) -> HumanLabels:
 
 
 def known_answers(label: ClipLabel, rubric: Rubric) -> dict[str, Answer]:
-    """What one person decided, by row of the table; stages pass where all their components do. None: unsure.
+    """What one person decided, by row of the table; of stages, see stage_labels. None: unsure.
 
     Raises:
         AuditError: a row that the rubric does not have, or a planning label without a level 0 to 3.
@@ -90,11 +90,7 @@ def known_answers(label: ClipLabel, rubric: Rubric) -> dict[str, Answer]:
             if row.level is None or row.level >= NUM_PLAN_LEVELS:
                 raise AuditError(f"evaluation {label.evaluation}: planning needs a level 0 to 3, got {row.level}")
             known[name] = row.level
-    for stage in (stage for stage in STAGES if stage in rubric.stages):
-        parts = [known.get(name) for name in rubric.stages[stage].components]
-        if any(name in known for name in rubric.stages[stage].components):
-            known[str(stage)] = False if False in parts else None if None in parts else True
-    return known
+    return {**known, **stage_labels(known, rubric)}
 
 
 def find_evaluation(

@@ -35,7 +35,7 @@ class HumanJudge:
     def capabilities(self) -> Capabilities:
         return Capabilities(
             f"human:{self._sha}", "human", ", ".join(self._people), "", None,
-            deterministic=True, card=f"labels of {', '.join(self._people)} on {len(self._said)} clips",
+            card=f"labels of {', '.join(self._people)} on {len(self._said)} clips",
         )
 
     async def health(self) -> Health:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from contextvars import ContextVar
 from typing import Any
 
-from wm_nodes.judge.agent.judge import Capabilities, Health, Judge, JudgeError, Read, ReadRequest
+from wm_nodes.judge.agent.judge import ForwardingJudge, Judge, JudgeError, Read, ReadRequest
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import ClipRef, Evidence, TaskSpec
@@ -18,36 +18,24 @@ _EVALUATION: ContextVar[int] = ContextVar("evaluation")
 """Line of the evaluation that the running task belongs to; reads of several clips are written between each other."""
 
 
-class AuditedAgent:
-    """Judges clips as RewardAgent does, with the same verdicts, and writes everything into a log.
+class AuditedAgent(RewardAgent):
+    """A RewardAgent that writes everything into a log, with the same verdicts.
 
     Args:
         settings: of RewardAgent. round_number: of the paper's loop, kept with every verdict; may be changed.
     """
 
     def __init__(self, judge: Judge, rubric: Rubric, log: AuditLog, *, round_number: int = 0, **settings: Any) -> None:
+        super().__init__(RecordingJudge(judge, log), rubric, **settings)
         self.round_number = round_number
         self._log, self._store = log, MediaStore(log.folder)
-        self._agent = agent = RewardAgent(RecordingJudge(judge, log), rubric, **settings)
         self._written: set[str] = set()
         log.append("rubric", rubric_body(rubric))
-        limits = {name: getattr(agent, name) for name in ("mode", "seed", "max_reads", "budget_s", "call_plan")}
+        limits = {name: getattr(self, name) for name in ("mode", "seed", "max_reads", "budget_s", "call_plan")}
         self._line = log.append(
             "agent",
             {"capabilities": plain(judge.capabilities), "rubric_version": rubric.version, "settings": plain(limits)},
         )
-
-    @property
-    def rubric(self) -> Rubric:
-        return self._agent.rubric
-
-    @property
-    def version(self) -> str:
-        return self._agent.version
-
-    @property
-    def judge(self) -> Judge:
-        return self._agent.judge
 
     async def evaluate(self, clip: ClipRef, task: TaskSpec, evidence: Evidence | None = None) -> Verdict:
         """Judge one clip; the verdict is on the disk when this returns. Raises OSError: it cannot be written down."""
@@ -60,32 +48,26 @@ class AuditedAgent:
         })
         token = _EVALUATION.set(evaluation)
         try:
-            verdict = await self._agent.evaluate(clip, task, evidence)
+            verdict = await super().evaluate(clip, task, evidence)
         finally:
             _EVALUATION.reset(token)
         self._log.append("verdict", {"evaluation": evaluation, "verdict": plain(verdict)}, sync=True)
         return verdict
 
 
-class RecordingJudge:
+class RecordingJudge(ForwardingJudge):
     """Hands questions on to a judge and writes them down with the answers, or with what went wrong."""
 
     def __init__(self, judge: Judge, log: AuditLog) -> None:
-        self._judge, self._log = judge, log
-
-    @property
-    def capabilities(self) -> Capabilities:
-        return self._judge.capabilities
-
-    async def health(self) -> Health:
-        return await self._judge.health()
+        super().__init__(judge)
+        self._log = log
 
     async def read(self, request: ReadRequest) -> list[Read]:
         evaluation = _EVALUATION.get()
         ask = self._log.append("ask", {"evaluation": evaluation, **ask_body(request)})
         about = {"evaluation": evaluation, "ask": ask}
         try:
-            reads = await self._judge.read(request)
+            reads = await super().read(request)
         except (Exception, asyncio.CancelledError) as error:
             cost = plain(error.cost) if isinstance(error, JudgeError) else None
             failure = {"error": type(error).__name__, "reason": str(error), "cost": cost}

@@ -3,7 +3,8 @@
     vllm serve MODEL --enable-prefix-caching --limit-mm-per-prompt '{"image": 40, "video": 1}'
 
     transport = ChatTransport([Endpoint("http://127.0.0.1:8000/v1", "MODEL")])
-    agent = RewardAgent(OpenAIJudge(transport, rubric, cache=VerdictCache(folder)), rubric)
+    judge = OpenAIJudge(transport, rubric, load_config("cpu").judge, VerdictCache(folder))
+    agent = RewardAgent(judge, rubric)
 
 A profile sends up to 32 images. Keys come from environment variables only (Endpoint.api_key_env). Label votes need a
 server with logprobs; `transformers serve` has none, so votes after the first are errors there.

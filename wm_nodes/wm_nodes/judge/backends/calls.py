@@ -9,9 +9,10 @@ import hashlib
 import json
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from wm_nodes.config.judge import JudgeConfig
 from wm_nodes.judge.agent import topreward
 from wm_nodes.judge.agent.judge import Cost, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.levels import map_back, one_hot, option_order
@@ -25,6 +26,8 @@ from wm_nodes.judge.backends.transport import ChatAnswer, ChatTransport, Transpo
 JSON_TRIES = 2
 MEASURED_CALLS = 200
 SEED_LIMIT = 2**31
+MAX_ANSWER_TOKENS = 1024
+"""Of a JSON answer, if extra_body sets none; one that needs more has failed."""
 MIN_LABEL_MASS = 0.5
 """A label read with less abstains, unless its answers are chosen by a grammar."""
 OWN_FIELDS = frozenset((
@@ -36,41 +39,6 @@ TOKEN_LIMITS = frozenset(("max_tokens", "max_completion_tokens"))
 """Whichever of them extra_body sets stands in the place of the judge's own limit."""
 Exchange = Mapping[str, Any]
 """The texts of a request and the raw reply, as JSON values, for an audit log."""
-
-
-@dataclass(frozen=True)
-class ChatOptions:
-    """How a server is asked."""
-
-    json_timeout_s: float = 120.0
-    """Per try of a JSON answer."""
-    label_timeout_s: float = 60.0
-    """Per try of a letter."""
-    budget_s: float = 300.0
-    """All calls of one ReadRequest together, waits included."""
-    max_answer_tokens: int = 1024
-    """Of a JSON answer, if extra_body sets none; one that needs more has failed."""
-    label_token_ids: tuple[int, ...] = ()
-    """Token ids of A to E, where the server can be asked for their probabilities by id."""
-    choice_grammar: bool = False
-    """Label reads choose among the letters only, so that the label mass no longer warns."""
-    max_images: int = 64
-    """That the server takes in one call."""
-    video: bool = False
-    """The dense profile goes as one video (vLLM, --limit-mm-per-prompt with a video), else as images."""
-    repeat_share: float = 0.0
-    """Of the calls that are asked twice, so that it is known how often a live server contradicts itself; the first
-    answer counts."""
-    extra_body: Mapping[str, Any] = field(default_factory=dict)
-    """Further fields of every request."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.repeat_share <= 1:
-            raise ValueError(f"repeat_share must lie in [0, 1], got {self.repeat_share}")
-        if self.label_token_ids and len(self.label_token_ids) != len(LETTERS):
-            raise ValueError(f"label_token_ids must hold {len(LETTERS)} ids, of A to E, got {self.label_token_ids}")
-        if not min(self.json_timeout_s, self.label_timeout_s, self.budget_s) > 0:
-            raise ValueError(f"timeouts and budget must be > 0 s, got {self}")
 
 
 @dataclass(frozen=True)
@@ -135,13 +103,13 @@ class Caller:
     """
 
     def __init__(
-        self, transport: ChatTransport, prompts: Prompts, options: ChatOptions,
+        self, transport: ChatTransport, prompts: Prompts, settings: JudgeConfig,
         on_exchange: Callable[[Exchange], None] = lambda exchange: None,
     ) -> None:
         self._on_exchange = on_exchange
         self.latencies_s: deque[float] = deque(maxlen=MEASURED_CALLS)
         self.label_masses: deque[float] = deque(maxlen=MEASURED_CALLS)
-        self._transport, self._prompts, self._options = transport, prompts, options
+        self._transport, self._prompts, self._settings = transport, prompts, settings
 
     def prompt(self, call: Call) -> Prompt:
         return self._json_prompt(call) if call.vote.kind == "json" else self._label_prompt(call, call.components[0])
@@ -161,7 +129,7 @@ class Caller:
     async def _ask_json(self, call: Call, body: dict[str, Any], form: AnswerFormat, bill: CallCost) -> list[Read]:
         messages, problem = body["messages"], ""
         for _ in range(JSON_TRIES):
-            answer = await self._send(call, body, bill, self._options.json_timeout_s)
+            answer = await self._send(call, body, bill, self._settings.json_timeout_s)
             try:
                 findings = form.read(_answer_text(answer.completion))
             except AnswerError as error:
@@ -185,11 +153,11 @@ class Caller:
         return replace(read, reason=read.reason or f"label read, because JSON answers were refused: {problem}")
 
     async def _ask_label(self, call: Call, component: Component, prompt: Prompt, bill: CallCost) -> Read:
-        options, order = self._options, prompt.reader
+        settings, order = self._settings, prompt.reader
         assert isinstance(order, tuple)  # label prompts are read by the order of their options
-        answer = await self._send(call, prompt.body, bill, options.label_timeout_s)
+        answer = await self._send(call, prompt.body, bill, settings.label_timeout_s)
         truth = call.vote.kind == "truth"
-        constrained = options.choice_grammar and not truth
+        constrained = settings.choice_grammar and not truth
         words = topreward.WORDS if truth else LETTERS[: len(order)]
         probabilities, mass = option_probabilities(answer.completion, words)
         self.label_masses.append(mass)
@@ -218,22 +186,22 @@ class Caller:
             problems=self._prompts.rubric.component_names,
             prior={score.component: level for score in request.prior if (level := prior_level(score)) is not None},
         )
-        fields = {"max_tokens": self._options.max_answer_tokens, "response_format": form.response_format}
+        fields = {"max_tokens": MAX_ANSWER_TOKENS, "response_format": form.response_format}
         messages = self._prompts.json_question(call.media, request, call.components, form)
-        return Prompt(call, messages, fields, form, self._options.extra_body)
+        return Prompt(call, messages, fields, form, self._settings.extra_body)
 
     def _label_prompt(self, call: Call, component: Component) -> Prompt:
-        request, options = call.request, self._options
+        request, settings = call.request, self._settings
         if call.vote.kind == "truth":  # neither token ids, which are those of letters, nor a grammar
             messages = self._prompts.truth_question(call.media, request)
-            return Prompt(call, messages, label_options(topreward.WORDS), (), options.extra_body)
+            return Prompt(call, messages, label_options(topreward.WORDS), (), settings.extra_body)
         count = NUM_PLAN_LEVELS if request.stage is Stage.PLAN else NUM_LEVELS
         order = option_order(call.vote, request.clip.sha256, component, count)
         messages = self._prompts.label_question(call.media, request, component, call.vote, order)
         fields = label_options(
-            LETTERS[:count], token_ids=options.label_token_ids[:count], grammar=options.choice_grammar
+            LETTERS[:count], token_ids=settings.label_token_ids[:count], grammar=settings.choice_grammar
         )
-        return Prompt(call, messages, fields, order, options.extra_body)
+        return Prompt(call, messages, fields, order, settings.extra_body)
 
 
 def describe_request(call: Call, body: Mapping[str, Any]) -> dict[str, Any]:

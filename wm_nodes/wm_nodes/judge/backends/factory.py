@@ -17,9 +17,10 @@ from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import Stage
 from wm_nodes.judge.backends import one_class
 from wm_nodes.judge.backends.cache import VerdictCache
-from wm_nodes.judge.backends.calls import OWN_FIELDS, ChatOptions, Exchange
+from wm_nodes.judge.backends.calls import OWN_FIELDS, Exchange
 from wm_nodes.judge.backends.one_class import OneClassJudge
 from wm_nodes.judge.backends.openai_client import OpenAIJudge
+from wm_nodes.judge.backends.prompts import LETTERS
 from wm_nodes.judge.backends.routed import RoutedJudge
 from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy
 from wm_nodes.judge.one_class.ranges import KEPT, has_ranges
@@ -85,6 +86,10 @@ def _check_one(settings: JudgeConfig) -> None:
         raise ValueError(
             "judge.api_key_env must be the name of an environment variable, e.g. JUDGE_API_KEY; what is there is no "
             "name, perhaps a key, and is not repeated here"
+        )
+    if settings.label_token_ids and len(settings.label_token_ids) != len(LETTERS):
+        raise ValueError(
+            f"judge.label_token_ids must hold {len(LETTERS)} ids, of A to E, or none, got {settings.label_token_ids}"
         )
     if taken := sorted(OWN_FIELDS & settings.extra_body.keys()):
         raise ValueError(f"judge.extra_body sets {', '.join(taken)}, which the judge sets itself; leave it out")
@@ -203,14 +208,8 @@ def _open(
         [Endpoint(url, settings.model, settings.api_key_env, settings.max_in_flight) for url in settings.endpoints],
         retry=RetryPolicy(settings.tries),
     )
-    options = ChatOptions(
-        json_timeout_s=settings.json_timeout_s, label_timeout_s=settings.label_timeout_s,
-        budget_s=settings.clip_budget_s, max_images=settings.max_images, video=settings.video,
-        choice_grammar=settings.choice_grammar, label_token_ids=tuple(settings.label_token_ids),
-        repeat_share=settings.repeat_share, extra_body=settings.extra_body,
-    )
     cache = VerdictCache(reads) if reads is not None and settings.keep_reads else None
-    return OpenedJudge(OpenAIJudge(transport, rubric, options, cache, on_exchange), transport.close)
+    return OpenedJudge(OpenAIJudge(transport, rubric, settings, cache, on_exchange), transport.close)
 
 
 async def _close_nothing() -> None:

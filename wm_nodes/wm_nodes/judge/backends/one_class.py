@@ -85,12 +85,9 @@ class OneClassJudge:
 
     Raises:
         ModelFolderError: the folder holds no world model, or no ranges of this model.
-        ValueError: conformal is not below KEPT.
     """
 
     def __init__(self, folder: Path, conformal: float = 0.0, device: str = CPU) -> None:
-        if not 0 <= conformal < KEPT:
-            raise ValueError(f"judge.conformal must be below {KEPT}, the share that the limit keeps, got {conformal}")
         self._folder = folder
         self._models: WorldModels = load_model_folder(folder, compute_device(device))
         self._ranges = ranges_of(folder, self._models.manifest)
@@ -106,7 +103,7 @@ class OneClassJudge:
     def capabilities(self) -> Capabilities:
         """What it reads, and who it is."""
         return Capabilities(
-            self.name, "embedded", f"one-class {self.sha256[:12]}", REVISION, KNOWN, deterministic=True, card=self.card
+            self.name, "embedded", f"one-class {self.sha256[:12]}", REVISION, KNOWN, card=self.card
         )
 
     @cached_property
@@ -171,7 +168,7 @@ class OneClassJudge:
 
     def _measure(self, clip: ClipRef, task: TaskSpec) -> tuple[NormalRanges, Finding]:
         ranges = nearest_ranges(self._ranges, self._models.manifest, clip.fps)
-        reason = self.unfit_reason(clip.frames.shape, clip.fps)
+        reason = unfit_reason(self._ranges, self._models.manifest, clip.frames.shape, clip.fps)
         if not reason and task.reference_frame.shape != clip.frames.shape[1:]:
             height, width = task.reference_frame.shape[:2]
             reason = f"the reference frame is {height} x {width} px, the clip is not"
@@ -185,10 +182,6 @@ class OneClassJudge:
         for name, component in COMPONENTS.items():
             worst[component] = max(worst.get(component, (-math.inf, "")), (strange[name], name))
         return ranges, Finding("", worst, done, self._naming(task, ranges))
-
-    def unfit_reason(self, shape: tuple[int, ...], fps: float | None = None) -> str:
-        """As the function of this name."""
-        return unfit_reason(self._ranges, self._models.manifest, shape, fps)
 
     def _naming(self, task: TaskSpec, ranges: NormalRanges) -> tuple[Status, str]:
         """Whether every coloured thing that the instruction names is in the reference frame."""

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from wm_nodes.config.judge import JudgeConfig
 from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, JudgeError, Read, ReadRequest
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import PLANNING, Stage, Status
@@ -16,7 +17,6 @@ from wm_nodes.judge.backends.calls import (
     Call,
     CallCost,
     Caller,
-    ChatOptions,
     Exchange,
     Prompt,
     describe_request,
@@ -34,6 +34,7 @@ class OpenAIJudge:
     """A Judge over a ChatTransport. All its endpoints serve one model. Belongs to one event loop, like its transport.
 
     Args:
+        settings: how it is asked; endpoints, model and key are the transport's.
         cache: reads bought before; a hit repeats the Reads with the cost they had then, wall_s 0.
         on_exchange: called with the words of every request and its raw reply, or with "cached" in place of one.
 
@@ -42,17 +43,17 @@ class OpenAIJudge:
     """
 
     def __init__(
-        self, transport: ChatTransport, rubric: Rubric, options: ChatOptions | None = None,
+        self, transport: ChatTransport, rubric: Rubric, settings: JudgeConfig,
         cache: VerdictCache | None = None, on_exchange: Callable[[Exchange], None] = lambda exchange: None,
     ) -> None:
         if len(transport.models) != 1:
             raise ValueError(f"a judge's endpoints must serve one model, got {', '.join(sorted(transport.models))}")
         (self._model,) = transport.models
         self._transport, self._rubric, self._cache = transport, rubric, cache
-        self._options = options or ChatOptions()
-        self._prompts = Prompts(rubric, video=self._options.video)
+        self._settings = settings
+        self._prompts = Prompts(rubric, video=settings.video)
         self._on_exchange = on_exchange
-        self._caller = Caller(transport, self._prompts, self._options, on_exchange)
+        self._caller = Caller(transport, self._prompts, settings, on_exchange)
         self._plan = CallPlan()
         self._counts: Counter[str] = Counter()
 
@@ -60,7 +61,7 @@ class OpenAIJudge:
     def capabilities(self) -> Capabilities:
         components = frozenset({*self._rubric.component_names, *self._rubric.hack.patterns, PLANNING})
         return Capabilities(
-            f"{TRANSPORT}:{self._model}", TRANSPORT, self._model, "", components, max_frames=self._options.max_images
+            f"{TRANSPORT}:{self._model}", TRANSPORT, self._model, "", components, max_frames=self._settings.max_images
         )
 
     async def read(self, request: ReadRequest) -> list[Read]:
@@ -112,7 +113,7 @@ class OpenAIJudge:
         for name in request.components:
             self._prompts.entry(request.stage, name)
         media = self._prompts.media(request)
-        deadline = time.monotonic() + self._options.budget_s
+        deadline = time.monotonic() + self._settings.clip_budget_s
         media_sha = sha_of(media)
         calls: list[Call] = []
         for vote in request.votes:
@@ -139,7 +140,7 @@ class OpenAIJudge:
         cost = reads[0].cost
         if known is not None:
             self._on_exchange({**describe_request(call, prompt.body), "cached": True})
-        elif int(key[:8], 16) < self._options.repeat_share * 16**8 and not _is_unanswered(reads):
+        elif int(key[:8], 16) < self._settings.repeat_share * 16**8 and not _is_unanswered(reads):
             reads = await self._repeat_call(call, prompt, reads)
         if known is None and self._cache is not None:
             self._cache.put(key, reads)

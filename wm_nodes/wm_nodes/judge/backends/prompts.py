@@ -124,8 +124,6 @@ class Prompts:
         return "\n\n".join(f"{name}: {entry.question}\n{_levels(entry.levels)}" for name, entry in entries)
 
     def _question_text(self, stage: Stage, components: Sequence[Component]) -> str:
-        for component in components:
-            self.entry(stage, component)
         if stage is Stage.PLAN:
             return "Judge the clip as a whole. List the components with a visible problem, worst first, or none."
         if stage is Stage.HACK:

@@ -50,7 +50,6 @@ class RoutedJudge:
             f"{TRANSPORT}:{hashlib.sha256(who.encode()).hexdigest()[:12]}", TRANSPORT, who,
             "; ".join(part.server_version for _, part in able if part.server_version), self._components,
             max_frames=min(part.max_frames for _, part in able),
-            deterministic=all(part.deterministic for _, part in able),
             card="\n".join(f"{stages}: {part.card or part.judge_id}" for stages, part in able),
         )
 

@@ -43,7 +43,7 @@ class Attack:
         reasons = Counter[str]()
         with tqdm(total=most * PER_CLIP, desc="edits judged", unit="edit", disable=None) as bar:
             for job in jobs:
-                (verdict,) = self._ask([job])
+                (verdict,) = self._judge.judge([job])
                 if self._is_paid(verdict):
                     self.paid += 1
                     self._edit(job, verdict.reward, bar)
@@ -70,9 +70,6 @@ class Attack:
             paths.append(folder / name)
         return paths
 
-    def _ask(self, jobs: list[ClipJob]) -> list[Verdict]:
-        return self._judge.judge(jobs)
-
     def _is_paid(self, verdict: Verdict) -> bool:
         if self._least is None:
             return accepts(verdict) is True
@@ -97,7 +94,8 @@ class Attack:
         self._judge_edited(waiting, clip.frames, bar)
 
     def _judge_edited(self, waiting: list[tuple[Attempt, ClipJob]], before: UInt8Array, bar: tqdm) -> None:
-        for (unseen, job), verdict in zip(waiting, self._ask([job for _, job in waiting]), strict=True):
+        verdicts = self._judge.judge([job for _, job in waiting])
+        for (unseen, job), verdict in zip(waiting, verdicts, strict=True):
             reward = verdict.reward if verdict.valid else None
             paid = self._is_paid(verdict)
             attempt = replace(unseen, visible=True, status=str(verdict.status), paid=paid, reward=reward)

@@ -39,7 +39,7 @@ def verdict_msg(verdict: Verdict) -> ClipVerdict:
         reflections=[line for reflection in verdict.reflections for line in _lines(reflection)],
         num_reads=verdict.num_reads, calls=cost.calls, prompt_tokens=cost.prompt_tokens,
         cached_tokens=cost.cached_tokens, completion_tokens=cost.completion_tokens, images=cost.images,
-        retries=cost.retries, usd=math.nan if cost.usd is None else cost.usd, wall_s=cost.wall_s, judge_id=by.judge_id,
+        retries=cost.retries, usd=math.nan, wall_s=cost.wall_s, judge_id=by.judge_id,
         transport=by.transport, model=by.model, server_version=by.server_version, rubric_version=by.rubric_version,
         prompt_sha=by.prompt_sha, media_sha=by.media_sha, judge_seed=by.seed, audit_id=verdict.audit_id,
     )

@@ -115,7 +115,7 @@ def _describe_clip(record: Record, evaluation: RecordedEvaluation, chosen: Sampl
         "rows": _describe_rows(evaluation, verdict, record.rubric(evaluation)),
         "reflections": [asdict(second) for second in verdict.reflections],
         "evidence": evaluation.evidence,
-        "cost": {name: value for name, value in vars(verdict.cost).items() if value is not None},
+        "cost": vars(verdict.cost),
         "reads": verdict.num_reads,
     }
 
