@@ -28,6 +28,7 @@ from video_toys import grpo_config, kl_config, rollout_config  # noqa: E402
 
 from wm_nodes.apps.cli import main  # noqa: E402
 from wm_nodes.config.video import RolloutConfig  # noqa: E402
+from wm_nodes.core.imports import MissingPackageError  # noqa: E402
 from wm_nodes.core.model_folder import ModelFolderError  # noqa: E402
 from wm_nodes.video_model import (  # noqa: E402
     Condition,
@@ -40,7 +41,6 @@ from wm_nodes.video_model import (  # noqa: E402
 )
 from wm_nodes.video_model.adapters import (  # noqa: E402
     CosmosVelocity,
-    MissingPackageError,
     PublicVelocity,
     TextEncoder,
     VideoCodec,
