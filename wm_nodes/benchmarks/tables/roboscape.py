@@ -60,7 +60,7 @@ def table_1() -> Rows:
 
 def table_1_gains() -> Rows:
     for training, inputs, base, task in product(
-        (MODEL, GOAL, REFRESHED), (POSITIONS, "latents"), (SFT, ONE_SCENE, ALL_SCENES), (*TASKS, OURS)
+        (MODEL, GOAL, PROGRESS, REFRESHED), (POSITIONS, "latents"), (SFT, ONE_SCENE, ALL_SCENES), (*TASKS, OURS)
     ):
         if text := gain([*trained(training, task, inputs), *trained(base, task, inputs)], base, training):
             yield task, inputs, PAYS[training], LABELS[base], text
