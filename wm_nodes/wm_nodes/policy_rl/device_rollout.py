@@ -209,6 +209,7 @@ class DeviceCollector:
         if self._goals is not None:
             goals, found, _ = self._goals
             latents = columns.get("latents", columns["features"][..., : goals.shape[-1]])  # without positions
+            # step by step: the golden features of all steps at once are gigabytes
             dense = reward.config.dense_weight * torch.stack([
                 reward.approach(self._near(before, starts), self._near(after, starts))
                 for before, after, starts in zip(latents[:-1], latents[1:], columns["starts"], strict=True)
@@ -240,10 +241,11 @@ class DeviceCollector:
                 raise ValueError("reward.mode progress needs golden trajectories, and this environment was made for "
                                  "another mode; make it with the reward's settings")
             frames, lengths = golden.frames, golden.lengths
-        features = _distance_of(self._reward).encode(frames.reshape(-1, *frames.shape[2:]))
-        arrays = features.view(*frames.shape[:2], -1), torch.from_numpy(found), torch.from_numpy(lengths)
-        device = self.env.device
-        return arrays[0].to(device), arrays[1].to(device), arrays[2].to(device)
+        device, features = self.env.device, _distance_of(self._reward).encode(frames.reshape(-1, *frames.shape[2:]))
+        return (
+            features.view(*frames.shape[:2], -1).to(device), torch.from_numpy(found).to(device),
+            torch.from_numpy(lengths).to(device),
+        )
 
 
 def capture_graph(device: torch.device, step: Step) -> Step:
