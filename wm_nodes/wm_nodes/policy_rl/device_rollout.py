@@ -32,6 +32,9 @@ from wm_nodes.world_model import DeviceEnvironment, ImaginedEnvironment
 from wm_nodes.world_model.starts import start_of
 
 MOST_HASHED_STARTS = 1024
+MOST_GOLDEN_FRAMES = 4096
+"""Goals that are compared with frames at once: features of golden trajectories at every step of a rollout are
+gigabytes."""
 WARM_UP_STEPS = 3
 
 Step = Callable[[], None]
@@ -207,25 +210,27 @@ class DeviceCollector:
         valid = columns["valid"] & torch.isfinite(signal) & torch.isfinite(spread)
         rewards = reward.config.sparse_weight * reward.crossed(signal, spread).float()
         if self._goals is not None:
-            goals, found, _ = self._goals
+            (goals, found, _), starts = self._goals, columns["starts"]
             latents = columns.get("latents", columns["features"][..., : goals.shape[-1]])  # without positions
-            # step by step: the golden features of all steps at once are gigabytes
-            dense = reward.config.dense_weight * torch.stack([
-                reward.approach(self._near(before, starts), self._near(after, starts))
-                for before, after, starts in zip(latents[:-1], latents[1:], columns["starts"], strict=True)
+            parts = zip(*(
+                each.split(max(1, MOST_GOLDEN_FRAMES // (goals.shape[1] * len(starts[0]))))
+                for each in (latents[:-1], latents[1:], starts)
+            ), strict=True)
+            dense = reward.config.dense_weight * torch.cat([
+                reward.approach(self._near(before, begun), self._near(after, begun)) for before, after, begun in parts
             ])
-            valid = valid & found[columns["starts"]] & torch.isfinite(dense)
+            valid = valid & found[starts] & torch.isfinite(dense)
             rewards = dense + rewards
         return torch.where(valid, rewards, float("nan")), valid
 
-    def _near(self, latents_NF: Tensor, starts_N: Tensor) -> Tensor:
-        """How near to the goals of their starts the frames are (N,), see EndogenousReward.approach."""
+    def _near(self, latents_TNF: Tensor, starts_TN: Tensor) -> Tensor:
+        """How near to the goals of their starts the frames are (T, N), see EndogenousReward.approach."""
         assert self._goals is not None  # _rewards has looked
         goals, _, lengths = self._goals
-        distances = _distance_of(self._reward).between(latents_NF.unsqueeze(1), goals[starts_N])
+        distances = _distance_of(self._reward).between(latents_TNF.unsqueeze(2), goals[starts_TN])
         if self._reward.config.mode == "progress":
-            return progress_along(distances, lengths[starts_N])
-        return 1 - distances[:, 0]
+            return progress_along(distances, lengths[starts_TN])
+        return 1 - distances[..., 0]
 
     def _encode_goals(self) -> tuple[Tensor, Tensor, Tensor] | None:
         """Features (M, K, F) of the starts' goals, one each, or of their golden trajectories, found flags (M,), and how
