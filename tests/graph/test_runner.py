@@ -181,6 +181,8 @@ def test_ctrl_c_ends_all_nodes_and_the_starter_with_code_0(ros_domain: int, tmp_
     assert process.wait(timeout=30) == 0, "".join(lines)
 
 
+SHOWN = "import faulthandler, signal; faulthandler.register(signal.SIGUSR1); "
+"""So that a start that does not end shows where it is."""
 START = "from wm_nodes.launching.start import start; print('begun', flush=True); sys.exit(start('online_training'))"
 VERB = (
     "from wm_nodes.apps.cli import run_verb; print('begun', flush=True); "
@@ -195,14 +197,22 @@ VERB = (
 def test_ctrl_c_in_the_first_seconds_of_a_start_ends_it_with_one_line_and_code_130(
     ros_domain: int, tmp_path: Path, program: str, given: list[str], moment_s: float
 ) -> None:
-    command = [sys.executable, "-c", f"import sys; {program}", *(word.format(tmp_path / "run") for word in given)]
+    words = [word.format(tmp_path / "run") for word in given]
+    command = [sys.executable, "-c", f"import sys; {SHOWN}{program}", *words]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
     )
     assert process.stdout is not None and process.stdout.readline() == "begun\n"
     time.sleep(moment_s)
     os.killpg(process.pid, signal.SIGINT)
-    said, _ = process.communicate(timeout=60)
+    try:
+        said, _ = process.communicate(timeout=60)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGUSR1)
+        time.sleep(1.0)
+        os.killpg(process.pid, signal.SIGKILL)
+        said, _ = process.communicate()
+        pytest.fail(f"it has not ended:\n{said}")
     assert process.returncode == 130 and said.count("interrupted") == 1 and "Traceback" not in said, said
     assert "interrupted" in said.splitlines()[-1]
 

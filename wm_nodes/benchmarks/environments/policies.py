@@ -9,11 +9,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from benchmarks.video_rl.comparison import paired_interval
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import file_sha256
 from wm_nodes.core.model_folder import files_sha256
@@ -238,3 +240,11 @@ def rate_of(result: EvaluationResult) -> dict[str, float]:
     low, high = wilson_interval(result.successes, result.episodes)
     return {"rate": result.success_rate, "successes": result.successes, "episodes": result.episodes, "low": low,
             "high": high}
+
+def rate_over_seeds(rates: Sequence[float]) -> str:
+    """Mean of percentages, with its t interval (inside 0 to 100) where there are several."""
+    text = f"{fmean(rates):.1f}"
+    if len(rates) == 1:
+        return text
+    over = paired_interval(rates)
+    return f"{text} ({max(0.0, over.low):.1f} to {min(100.0, over.high):.1f})"

@@ -6,13 +6,16 @@ A clone has seen demonstrations of one scene alone. IND is that scene, OOD the m
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal, get_args
 
-from benchmarks.environments.experiments import Configured, is_finished
+from benchmarks.environments.experiments import Configured
+from benchmarks.environments.figures import draw_policies, extreme_table, measure_extreme
 from benchmarks.environments.learned_rewards import EMBEDDING, PROXY, Learned, environment_paid_by
-from benchmarks.environments.policies import SIMULATOR, WORLD_MODEL, Workplace, rate_of, train_on
+from benchmarks.environments.policies import SIMULATOR, WORLD_MODEL, Workplace, rate_of, rate_over_seeds, train_on
 from benchmarks.environments.reward_test import measure_rewards, rewards_table
 from benchmarks.experiment import Count, console
 from benchmarks.video_rl.comparison import paired_interval
@@ -24,6 +27,7 @@ from wm_nodes.core.model_folder import files_sha256
 from wm_nodes.core.progress import tqdm
 from wm_nodes.policy_rl.model_refresh import RefreshDecision, refresh_round, round_folder
 from wm_nodes.reports.console_table import make_table
+from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model import ImaginedEpisodes
 from wm_nodes.world_model.folder import read_world_manifest
 
@@ -43,6 +47,7 @@ DENSE = {GOAL: "delta", PROGRESS: "progress"}
 LEARNED: dict[str, Learned] = {"embedding": EMBEDDING, "proxy": PROXY}
 IN_MODEL = {MODEL, REFRESHED, *DENSE, *LEARNED}
 TABLE_1: tuple[Training, ...] = ("sft", "one_scene", "all_scenes", "world_model", "goal")
+FIGURE_4: tuple[Training, ...] = ("one_scene", "world_model", "embedding", "proxy")
 FIGURE_2: tuple[Training, ...] = ("world_model", "goal", "progress", "embedding", "proxy")
 OOD, TRAIN = ("ood_object", "ood_combo"), "train"
 PAPER = {
@@ -65,14 +70,16 @@ class RoboScape(Configured):
     """RoboScape-R at this size. Table 1: success of a policy cloned in one scene, after RL in the simulator on that
     scene, on all training scenes, and in the world model; measured in its scene (IND), with unseen objects and in
     unseen combinations (OOD). Figure 2: the same of RL in the world model by several rewards. Figure 3: how well each
-    reward tells, on imagined steps, what succeeds in the simulator. What --json holds is not made again."""
+    reward tells, on imagined steps, what succeeds in the simulator. Figure 4: film strips of policies by what pays.
+    Figure 9: how imagined steps obey extreme actions. What --json holds is not made again."""
 
     preset: str = "fair_start"
     """Of the settings: a name, or a .yaml."""
     table: Literal["1"] | None = None
     """The trainings of this table, the default."""
-    figure: Literal["2", "3"] | None = None
-    """The trainings of Figure 2, or Figure 3, which trains nothing but the learned rewards."""
+    figure: Literal["2", "3", "4", "9"] | None = None
+    """The trainings of Figure 2 or of Figure 4, which draws their first episode; or Figure 3 or 9, which train no
+    policy. Pictures are in --work."""
     tasks: tuple[str, ...] = TASKS
     """Columns."""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -90,10 +97,10 @@ class RoboScape(Configured):
     def run(self) -> None:
         if self.table and self.figure:
             raise ValueError("--table and --figure are two runs; give one of them")
-        if self.figure == "3":
-            self._test_rewards()
+        if self.figure in ("3", "9"):
+            self._test_model()
         else:
-            self._train(self.trainings or (FIGURE_2 if self.figure else TABLE_1))
+            self._train(self.trainings or {"2": FIGURE_2, "4": FIGURE_4}.get(self.figure or "", TABLE_1))
 
     def _train(self, trainings: Sequence[str]) -> None:
         shown = list[dict[str, Any]]()
@@ -102,33 +109,41 @@ class RoboScape(Configured):
             own = scene_of_seed(seed)
             place = self.workplace(task, seed, own, training)
             wanted = {**place.identity(SIMULATOR, (own, *OOD)), "model": training, "task": task, "seed": seed}
-            shown += self._once(wanted, _cell(place, training, own, self.learned_from, self.work))
+            shown += self.once(wanted, partial(_cell, place, training, own, self.learned_from, self.work))
         self._show(shown, trainings)
-
-    def _once(self, wanted: dict[str, Any], make: Iterator[dict[str, Any]]) -> list[dict[str, Any]]:
-        """The rows that --json holds of these values, else those made now; processes may share the file."""
-        if found := [row for row in self.read() if is_finished([row], wanted)]:
-            return found
-        made = [{**wanted, **row} for row in make]
-        self.write({"rows": [*self.read(), *made]}, device=wanted["config"]["device"])
-        return made
+        if self.figure == "4":
+            self._draw(shown)
 
     def workplace(self, task: str, seed: int, own: str, training: str) -> Workplace:
         dense = {"reward.dense_weight": 1.0, "reward.mode": DENSE[training]} if training in DENSE else {}
         config = load_config(self.preset, {"sft.scenes": own, **dense, **self.settings, "task": task, "seed": seed})
         return Workplace(config, self.model_dir or shipped_model(task), self.work.absolute() / f"{task}_{seed}")
 
-    def _test_rewards(self) -> None:
-        shown = list[dict[str, Any]]()
+    def _draw(self, rows: Sequence[dict[str, Any]]) -> None:
+        for task, seed in dict.fromkeys((row["task"], row["seed"]) for row in rows):
+            of = [row for row in rows if (row["task"], row["seed"]) == (task, seed)]
+            place = self.workplace(task, seed, of[0]["scene"], SFT)
+            weights = {LABELS[row["model"]]: Path(row["weights"]) for row in of}
+            for path in draw_policies(place, weights, (of[0]["scene"], *OOD), place.folder):
+                console.print(f"film strip: {path}")
+
+    def _test_model(self) -> None:
+        shown, of_rewards = list[dict[str, Any]](), self.figure == "3"
         for task in tqdm(self.tasks, desc="tasks", unit="task"):
             config = load_config(self.preset, {**self.settings, "task": task})
             folder = self.model_dir or shipped_model(task)
-            wanted = {
-                "config": config.model_dump(mode="json"), "learned_from": self.learned_from,
+            wanted: dict[str, Any] = {
+                "config": config.model_dump(mode="json"),
                 "world_model_sha256": files_sha256(read_world_manifest(folder)),
             }
-            shown += self._once(wanted, measure_rewards(config, folder, self.learned_from, self.work))
-        console.print(rewards_table(shown))
+            if of_rewards:
+                wanted["learned_from"] = self.learned_from
+                make = partial(measure_rewards, config, folder, self.learned_from, self.work)
+            else:
+                wanted["figure"] = self.figure
+                make = partial(measure_extreme, config, folder, self.work)
+            shown += self.once(wanted, make)
+        console.print(rewards_table(shown) if of_rewards else extreme_table(shown))
 
     def _show(self, rows: Sequence[dict[str, Any]], trainings: Sequence[str]) -> None:
         columns = [(task, domain) for task in self.tasks for domain in ("IND", "OOD")]
@@ -167,9 +182,12 @@ def _cell(
             for success_rate in train_on(workplace, policy, imagined, own if training == ONE_SCENE else TRAIN):
                 course.append(success_rate)
                 bar.update()
+    settings = sha256(config.model_dump_json().encode()).hexdigest()
+    weights = workplace.folder / f"{training}_{settings[:8]}.safetensors"
+    save_weights(policy, weights, {"tokenizer_sha256": policy.encoder.sha256})
     found = {name: workplace.real(policy, name) for name in (own, *OOD)}
     yield {
-        "scene": own, "course": course,
+        "scene": own, "course": course, "weights": str(weights),
         **({} if report is None else {"accepted": report.passed, "acceptance": report.to_dict()}),
         **({} if refresh is None else {"refresh": refresh.to_dict()}),
         "success": {
@@ -198,11 +216,7 @@ def cell(rows: Sequence[dict[str, Any]], domain: str) -> str:
     not accepted."""
     if not rows:
         return ""
-    rates = [success_of(row, domain) for row in rows]
-    text = f"{fmean(rates):.1f}"
-    if len(rates) > 1:
-        over = paired_interval(rates)
-        text = f"{text} ({max(0.0, over.low):.1f} to {min(100.0, over.high):.1f})"
+    text = rate_over_seeds([success_of(row, domain) for row in rows])
     return text if all(row.get("accepted", True) for row in rows) else f"[{text}]"
 
 

@@ -38,7 +38,8 @@ CUDA_RUNS = (
     "its own; let modules ask for a GPU in configure, not when they are imported\n"
 )
 _PR_SET_PDEATHSIG = 1
-_LIBC = ctypes.CDLL(None, use_errno=True)
+_prctl = ctypes.CDLL(None, use_errno=True).prctl
+"""Looked up here: between fork and exec the loader's lock may be another thread's."""
 
 
 class ForkServerError(RuntimeError):
@@ -150,7 +151,7 @@ def _await_orphan(pid: int) -> None:
 
 def end_with_parent() -> None:
     """Have the kernel end this process when the thread that made it ends."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    _prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def end_group(pid: int) -> None:

@@ -18,6 +18,7 @@ from types import FrameType
 from typing import TextIO
 
 from wm_nodes.core.errors import RunError
+from wm_nodes.core.interrupts import remembering_interrupts
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.domain_lock import DomainInUseError, DomainLock
 from wm_nodes.launching.environment import graph_environment, interpreter
@@ -270,7 +271,9 @@ def main(scenario: str, argv: Sequence[str] | None = None) -> int:
         parse_arguments(scenario, given)
         run_dir = run_folder(scenario, given)
         with RunLock(run_dir, say=_print, new=not given.get("run_dir")) as lock:
-            graph, values = launch_arguments.begin(scenario, {**given, "run_dir": str(lock.folder)})
+            with remembering_interrupts() as check:
+                graph, values = launch_arguments.begin(scenario, {**given, "run_dir": str(lock.folder)})
+                check()
             return run(graph, lock.folder, interpreter(values))
     except (DomainInUseError, ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

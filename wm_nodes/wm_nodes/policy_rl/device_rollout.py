@@ -212,12 +212,11 @@ class DeviceCollector:
         if self._goals is not None:
             (goals, found, _), starts = self._goals, columns["starts"]
             latents = columns.get("latents", columns["features"][..., : goals.shape[-1]])  # without positions
-            parts = zip(*(
-                each.split(max(1, MOST_GOLDEN_FRAMES // (goals.shape[1] * len(starts[0]))))
-                for each in (latents[:-1], latents[1:], starts)
-            ), strict=True)
+            together = max(1, MOST_GOLDEN_FRAMES // (goals.shape[1] * len(starts[0])))
+            parts = (slice(i, i + together) for i in range(0, len(starts), together))
             dense = reward.config.dense_weight * torch.cat([
-                reward.approach(self._near(before, begun), self._near(after, begun)) for before, after, begun in parts
+                reward.approach(*(self._near(seen[part], starts[part]) for seen in (latents[:-1], latents[1:])))
+                for part in parts
             ])
             valid = valid & found[starts] & torch.isfinite(dense)
             rewards = dense + rewards
