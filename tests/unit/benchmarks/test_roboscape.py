@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 from model_folders import make_model_folder
 
@@ -79,6 +80,28 @@ def test_every_training_is_made_once_and_measured_in_and_out_of_domain(
     assert rows[-1]["refresh"]["rows"][-1]["name"] == "done signal right"
     shown = capsys.readouterr().out
     assert "[0.0]" in shown and "RL in the simulator, all training scenes" in shown
+    assert main([*words, "--figure", "4"]) == 0 and json.loads(file.read_text(encoding="utf-8"))["rows"] == rows
+    strip = cv2.imread(str(tmp_path / "work" / "push_0" / f"push_{OOD[0]}.png"))
+    assert strip is not None and len(strip) > len(rows) * 2 * 64  # a row of pictures for each policy
+
+
+@pytest.mark.slow
+@pytest.mark.rendering
+def test_figure_9_follows_scripted_and_extreme_actions_in_every_domain_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = make_model_folder(tmp_path / "model", load_config("smoke", {"task": "push"}))
+    file = tmp_path / "rows.json"
+    words = ["reproduce", "roboscape", "--figure", "9", "--preset", "smoke", "--model-dir", str(model), "--tasks",
+             "push", "--json", str(file), "--work", str(tmp_path / "work"), "--evaluation.episodes", "2",
+             "--data.num_workers", "1", "--simulation.max_episode_steps", "4"]
+    assert main(words) == 0
+    rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
+    assert [(row["domain"], row["actions"]) for row in rows] == [
+        (domain, actions) for domain in ("train", *OOD) for actions in ("scripted", "extreme")
+    ]
+    assert all(Path(row["picture"]).exists() and "psnr_shuffled_drop_db_h04" in row["metrics"] for row in rows)
+    assert "rollouts of extreme actions" in capsys.readouterr().out
     assert main(words) == 0 and json.loads(file.read_text(encoding="utf-8"))["rows"] == rows
 
 
