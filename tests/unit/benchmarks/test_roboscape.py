@@ -118,7 +118,8 @@ def test_figure_3_scores_every_reward_in_every_domain_once(
     assert main(words) == 0
     rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
     assert {row["domain"] for row in rows} == {"train", *OOD}
-    assert [row["reward"] for row in rows[:3]] == ["done signal", "embedding head", "proxy network"]
+    rewards = ["done signal", "embedding head", "proxy network", "reward agent"]
+    assert [row["reward"] for row in rows[:4]] == rewards
     assert "AUROC, empty hand" in capsys.readouterr().out
     assert main(words) == 0 and json.loads(file.read_text(encoding="utf-8"))["rows"] == rows
 

@@ -6,6 +6,7 @@ simulator says which episodes succeed. Shapes: E episodes, T steps, F features.
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,9 @@ from wm_nodes.core.seeding import numpy_stream, torch_stream
 from wm_nodes.core.statistics import auroc
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.environments.record import collect_plan, task_plan
+from wm_nodes.judge.agent.types import TaskSpec, clip_ref
+from wm_nodes.judge.episode_reward import episode_judge
+from wm_nodes.judge.service import ClipJob, JudgeService
 from wm_nodes.policy_rl.factories import make_encoder, models_of
 from wm_nodes.recording import read_episodes
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
@@ -34,6 +38,7 @@ from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.text import ImaginedGoals, imagine_goals
 from wm_nodes.world_model.validation.open_loop import BATCH, ImaginedEpisodes, imagine
 
+JUDGE = "reward agent"
 EMPTY_HAND = "no_grasp"
 """The behaviour that moves like a demonstration and never closes the gripper."""
 BEHAVIOURS = {"expert": 0.4, EMPTY_HAND: 0.2, "noisy": 0.15, "near_miss": 0.15, "short": 0.1}
@@ -80,6 +85,7 @@ def measure_rewards(config: RunConfig, model_dir: Path, learned_from: int, work:
         found = imagined_episodes(config, models, domain, HELDOUT.take(episodes), episodes, work)
         goals = goals_of(models, found.real, config)
         scored = paid(found, goals, model_dir, config) | {name: head(found) for name, head in heads.items()}
+        scored[JUDGE] = judged(found, config)
         for name, values in scored.items():
             yield {"task": config.task, "domain": domain, "reward": name, **judge_reward(values, found, config.seed)}
 
@@ -186,6 +192,24 @@ def paid(
             totals[rows, t] = np.nan_to_num(reward.evaluate(step).total)
         sums[name] = np.cumsum(totals, 1)
     return sums
+
+
+def judged(found: Imagined, config: RunConfig) -> NDArray[np.float64]:
+    """What the reward agent pays, at the last step of an episode (E, T); 0 where it gives no verdict, as where it says
+    no. By default the embedded judge, which learned from recordings in which nothing is wrong.
+    """
+    settings, jobs = episode_judge(config), list[ClipJob]()
+    period = 1 / config.simulation.control_hz
+    for row, steps in enumerate(map(int, found.real.lengths)):
+        frames = found.frames[row, : steps + 1]
+        task = TaskSpec(found.real.instructions[row], config.task, settings.robot, frames[0], None,
+                        found.real.actions[row, :steps])
+        jobs.append(ClipJob(clip_ref(f"episode {row}", frames, period), task))
+    with closing(JudgeService(settings, seed=config.seed, device=config.device)) as judge:
+        verdicts = judge.judge(jobs)
+    rewards = np.array([verdict.reward if verdict.valid else 0.0 for verdict in verdicts])
+    at_end = np.arange(found.real.num_steps) >= found.real.lengths[:, None] - 1
+    return np.where(at_end, rewards[:, None], 0.0)
 
 
 def learned_heads(seen: Imagined, model_dir: Path, seed: int) -> dict[str, Callable[[Imagined], NDArray[np.float64]]]:
