@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from wm_nodes.judge.agent.rubric import load_rubric
+from wm_nodes.judge.agent.types import Stage
 from wm_nodes.judge.check_set import CHECK_SET, ClipTruth, load_check_set
 from wm_nodes.judge.decisions import row_names
 
@@ -60,6 +61,12 @@ def test_every_row_of_the_table_has_passing_and_failing_clips(truths: list[ClipT
     rows = [truth.rows(rubric) for truth in truths]
     for name in row_names(rubric):
         assert len({row[name] for row in rows} - {None}) >= 2, name
+
+
+def test_a_rubric_without_a_stage_has_no_row_of_it(truths: list[ClipTruth]) -> None:
+    rubric = load_rubric("robot")
+    without = rubric.model_copy(update={"stages": {s: of for s, of in rubric.stages.items() if s is not Stage.TC}})
+    assert truths[0].rows(rubric).keys() - truths[0].rows(without).keys() >= {*rubric.stages[Stage.TC].components}
 
 
 def test_a_changed_picture_is_refused_by_name(tmp_path: Path) -> None:

@@ -2,27 +2,33 @@
 
 import hashlib
 import os
+import threading
 from pathlib import Path
 
 
-def write_atomic(path: Path, data: bytes) -> None:
+def write_atomic(path: Path, data: bytes, *, flush: bool = True) -> None:
     """Write to a temporary name beside `path`, flush to disk, rename.
+
+    flush: False leaves the flush to the system, for small files that can be made again.
 
     Raises:
         OSError: e.g. a full disk; the temporary file is removed and an older file at `path` stays as it was.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.tmp")
     try:
         with open(temporary, "wb") as file:
             file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
+            if flush:
+                file.flush()
+                os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         text = f"cannot write {path}: {error.strerror}; free some space there, or take another folder"
         raise OSError(error.errno, text) from error
+    if not flush:
+        return
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)

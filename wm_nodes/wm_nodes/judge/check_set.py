@@ -70,7 +70,8 @@ class ClipTruth(BaseModel):
     def rows(self, rubric: Rubric) -> dict[str, bool | int | None]:
         """The right decision of every row of Table 2 (decisions.py); None where nobody can tell."""
         known: dict[str, bool | int | None] = {name: self.components.get(name) for name in rubric.component_names}
-        known |= dict.fromkeys(rubric.stages[Stage.TC].components, self.completion >= PASSES_FROM)
+        if Stage.TC in rubric.stages:
+            known |= dict.fromkeys(rubric.stages[Stage.TC].components, self.completion >= PASSES_FROM)
         return {**known, **stage_labels(known, rubric), PLANNING: self.planning, OVERALL: self.success}
 
 

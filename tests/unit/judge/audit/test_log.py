@@ -1,6 +1,8 @@
 """The chained file: what a crash and what a hand can do to it, and that both are seen."""
 
+import errno
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -190,3 +192,13 @@ def test_pictures_are_stored_once_lossless_and_checked(tmp_path: Path) -> None:
         store.get(name)
     with pytest.raises(AuditError, match="no name of a stored picture"):
         store.get("../../etc/passwd.png")
+
+
+def test_a_full_disk_leaves_no_piece_of_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(OSError, match=r"cannot write .*free some space"):
+        MediaStore(tmp_path).put(np.zeros((4, 4, 3), np.uint8))
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]

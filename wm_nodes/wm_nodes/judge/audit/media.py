@@ -2,8 +2,6 @@
 
 import hashlib
 import io
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.audit.log import AuditError
 
 FOLDER = "media"
@@ -29,10 +28,7 @@ class MediaStore:
         path = self.path(name)
         if path.is_file() and path.stat().st_size == len(data):
             return name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
-            file.write(data)
-        os.replace(file.name, path)
+        write_atomic(path, data, flush=False)
         return name
 
     def get(self, name: str) -> NDArray[Any]:

@@ -6,13 +6,12 @@ reruns are bit-equal, which live servers do not guarantee.
 
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
+from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.agent.judge import Read
 from wm_nodes.judge.agent.types import Status
 
@@ -44,11 +43,7 @@ class VerdictCache:
     def put(self, key: str, reads: Sequence[Read]) -> None:
         if any(read.status is Status.ERROR for read in reads):
             return
-        path = self._path(key)
-        path.parent.mkdir(exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
-            file.write(_READS.dump_json(tuple(reads)))
-        os.replace(file.name, path)
+        write_atomic(self._path(key), _READS.dump_json(tuple(reads)), flush=False)
 
     def _path(self, key: str) -> Path:
         return self._folder / key[:2] / f"{key}.json"
