@@ -10,6 +10,7 @@ from model_folders import make_model_folder
 
 from benchmarks.environments.roboscape import (
     ALL_SCENES,
+    MANY,
     MODEL,
     ONE_SCENE,
     OOD,
@@ -20,10 +21,12 @@ from benchmarks.environments.roboscape import (
     cell,
     gain,
     scene_of_seed,
+    success_of,
 )
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
 from wm_nodes.config.scenes import splits
+from wm_nodes.config.tasks import part_of
 
 
 def row(task: str, training: str, seed: int, ind: float, ood: float, **more: object) -> dict[str, Any]:
@@ -49,6 +52,16 @@ def test_a_cell_says_its_mean_its_interval_and_whether_the_model_is_accepted() -
     assert cell(two[:1], "IND") == "50.0" and cell(two[:1], "OOD") == "20.0" and cell([], "IND") == ""
     assert cell(two, "IND") == "55.0 (0.0 to 100.0)"
     assert cell([row("push", MODEL, 0, 50, 20, accepted=False)], "OOD") == "[20.0]"
+
+
+def test_success_of_one_policy_for_several_tasks_is_told_by_the_seeds_of_its_episodes() -> None:
+    first = 1_500_000
+    won = [int(part_of(MANY, first + number) == "push") for number in range(40)]
+    made = row(MANY, MODEL, 0, 50, 20, config={"evaluation": {"first_seed": first}})
+    for name in ("own", *OOD):
+        made["success"][name]["episodes_won"] = won
+    assert success_of(made, "OOD", "push") == 100 and success_of(made, "IND", "pull") == 0
+    assert success_of(made, "IND") == 50 and cell([made], "OOD", "push") == "100.0"
 
 
 def test_the_demonstrations_of_a_seed_are_of_one_training_scene() -> None:

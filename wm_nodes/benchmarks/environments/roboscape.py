@@ -1,5 +1,5 @@
-"""Table 1, Figures 2 and 3 of RoboScape-R at the size of this repository: the same clones, trained by RL in the
-simulator and in the world model, by several rewards, and measured in and out of domain.
+"""Tables 1 and 2, Figures 2, 3, 4 and 9 of RoboScape-R at the size of this repository: the same clones, trained by RL
+in the simulator and in the world model, by several rewards, and measured in and out of domain.
 
 A clone has seen demonstrations of one scene alone. IND is that scene, OOD the mean of ood_object and ood_combo.
 """
@@ -23,6 +23,7 @@ from wm_nodes.apps.seed_study import mean_gain
 from wm_nodes.config.load import load_config
 from wm_nodes.config.scenes import draw, splits
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.tasks import part_of, parts_of
 from wm_nodes.core.model_folder import files_sha256
 from wm_nodes.core.progress import tqdm
 from wm_nodes.policy_rl.model_refresh import RefreshDecision, refresh_round, round_folder
@@ -32,6 +33,8 @@ from wm_nodes.world_model import ImaginedEpisodes
 from wm_nodes.world_model.folder import read_world_manifest
 
 TASKS = ("pick_place", "push", "pull", "move_to_aim")
+MANY = "all_tasks"
+"""Of each episode's task its policy is told; an episode's seed says which it is."""
 Training = Literal[
     "sft", "one_scene", "all_scenes", "world_model", "refreshed", "goal", "progress", "embedding", "proxy"
 ]
@@ -46,6 +49,7 @@ DENSE = {GOAL: "delta", PROGRESS: "progress"}
 """The dense reward that pays beside the done signal, a value of reward.mode."""
 LEARNED: dict[str, Learned] = {"embedding": EMBEDDING, "proxy": PROXY}
 IN_MODEL = {MODEL, REFRESHED, *DENSE, *LEARNED}
+TABLE_2: tuple[Training, ...] = ("sft", "one_scene", "world_model")
 TABLE_1: tuple[Training, ...] = ("sft", "one_scene", "all_scenes", "world_model", "goal")
 FIGURE_4: tuple[Training, ...] = ("one_scene", "world_model", "embedding", "proxy")
 FIGURE_2: tuple[Training, ...] = ("world_model", "goal", "progress", "embedding", "proxy")
@@ -69,19 +73,20 @@ def scene_of_seed(seed: int) -> str:
 class RoboScape(Configured):
     """RoboScape-R at this size. Table 1: success of a policy cloned in one scene, after RL in the simulator on that
     scene, on all training scenes, and in the world model; measured in its scene (IND), with unseen objects and in
-    unseen combinations (OOD). Figure 2: the same of RL in the world model by several rewards. Figure 3: how well each
-    reward tells, on imagined steps, what succeeds in the simulator. Figure 4: film strips of policies by what pays.
-    Figure 9: how imagined steps obey extreme actions. What --json holds is not made again."""
+    unseen combinations (OOD). Table 2: the same of one policy for all tasks. Figure 2: the same of RL in the world
+    model by several rewards. Figure 3: how well each reward tells, on imagined steps, what succeeds in the simulator.
+    Figure 4: film strips of policies by what pays. Figure 9: how imagined steps obey extreme actions. What --json holds
+    is not made again."""
 
     preset: str = "fair_start"
     """Of the settings: a name, or a .yaml."""
-    table: Literal["1"] | None = None
-    """The trainings of this table, the default."""
+    table: Literal["1", "2"] | None = None
+    """The trainings of Table 1, the default, or those of Table 2, of the task all_tasks."""
     figure: Literal["2", "3", "4", "9"] | None = None
     """The trainings of Figure 2 or of Figure 4, which draws their first episode; or Figure 3 or 9, which train no
     policy. Pictures are in --work."""
-    tasks: tuple[str, ...] = TASKS
-    """Columns."""
+    tasks: tuple[str, ...] = ()
+    """Columns; without, those of the table."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Each has demonstrations and a scene of its own."""
     trainings: tuple[Training, ...] = ()
@@ -100,11 +105,16 @@ class RoboScape(Configured):
         if self.figure in ("3", "9"):
             self._test_model()
         else:
-            self._train(self.trainings or {"2": FIGURE_2, "4": FIGURE_4}.get(self.figure or "", TABLE_1))
+            of_figure = {"2": FIGURE_2, "4": FIGURE_4}.get(self.figure or "", TABLE_1)
+            self._train(self.trainings or (TABLE_2 if self.table == "2" else of_figure))
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        return self.tasks or ((MANY,) if self.table == "2" else TASKS)
 
     def _train(self, trainings: Sequence[str]) -> None:
         shown = list[dict[str, Any]]()
-        cells = [(task, seed, name) for task in self.tasks for seed in self.seeds for name in trainings]
+        cells = [(task, seed, name) for task in self.columns for seed in self.seeds for name in trainings]
         for task, seed, training in tqdm(cells, desc="cells", unit="cell"):
             own = scene_of_seed(seed)
             place = self.workplace(task, seed, own, training)
@@ -129,7 +139,7 @@ class RoboScape(Configured):
 
     def _test_model(self) -> None:
         shown, of_rewards = list[dict[str, Any]](), self.figure == "3"
-        for task in tqdm(self.tasks, desc="tasks", unit="task"):
+        for task in tqdm(self.columns, desc="tasks", unit="task"):
             config = load_config(self.preset, {**self.settings, "task": task})
             folder = self.model_dir or shipped_model(task)
             wanted: dict[str, Any] = {
@@ -146,15 +156,16 @@ class RoboScape(Configured):
         console.print(rewards_table(shown) if of_rewards else extreme_table(shown))
 
     def _show(self, rows: Sequence[dict[str, Any]], trainings: Sequence[str]) -> None:
-        columns = [(task, domain) for task in self.tasks for domain in ("IND", "OOD")]
+        columns = [(task, part, domain)
+                   for task in self.columns for part in parts_of(task) for domain in ("IND", "OOD")]
         lines = []
         for training in trainings:
-            found = [[row for row in rows if (row["model"], row["task"]) == (training, task)] for task, _ in columns]
-            cells = (cell(of, domain) for of, (_, domain) in zip(found, columns, strict=True))
-            lines.append((LABELS[training], *cells))
-            if any(paper := [_paper(training, task, domain) for task, domain in columns]):
+            of = {task: [row for row in rows if (row["model"], row["task"]) == (training, task)]
+                  for task in self.columns}
+            lines.append((LABELS[training], *(cell(of[task], domain, part) for task, part, domain in columns)))
+            if any(paper := [_paper(training, task, domain) for task, _, domain in columns]):
                 lines.append(("  paper", *paper))
-        names = [f"{task} {domain}" for task, domain in columns]
+        names = [f"{part} {domain}" for _, part, domain in columns]
         console.print(make_table("success, %; in brackets: the model is not accepted", ("", *names), lines))
         for base in (ONE_SCENE, ALL_SCENES):
             if text := gain(rows, base):
@@ -205,18 +216,23 @@ def _refreshed(workplace: Workplace) -> tuple[Workplace, RefreshDecision]:
     return replace(workplace, model_dir=round_folder(folder, 1) / "model"), decision
 
 
-def success_of(row: dict[str, Any], domain: str) -> float:
-    """Success in a domain, %."""
+def success_of(row: dict[str, Any], domain: str, part: str = "") -> float:
+    """Success in a domain, %. part: in those of its episodes alone that were of this one of parts_of its task."""
     names = (row["scene"],) if domain == "IND" else OOD
-    return 100 * fmean(row["success"][name]["rate"] for name in names)
+    if part in ("", row["task"]):
+        return 100 * fmean(row["success"][name]["rate"] for name in names)
+    first = row["config"]["evaluation"]["first_seed"]
+    won = [won for name in names for number, won in enumerate(row["success"][name]["episodes_won"])
+           if part_of(row["task"], first + number) == part]
+    return 100 * fmean(won) if won else float("nan")
 
 
-def cell(rows: Sequence[dict[str, Any]], domain: str) -> str:
+def cell(rows: Sequence[dict[str, Any]], domain: str, part: str = "") -> str:
     """Mean over seeds, with its t interval (inside 0 to 100) where there are several; in brackets where the model is
     not accepted."""
     if not rows:
         return ""
-    text = rate_over_seeds([success_of(row, domain) for row in rows])
+    text = rate_over_seeds([success_of(row, domain, part) for row in rows])
     return text if all(row.get("accepted", True) for row in rows) else f"[{text}]"
 
 

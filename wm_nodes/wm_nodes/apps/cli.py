@@ -69,7 +69,7 @@ GROUPS = {
         "benchmark trained-in": "policies trained in each model, measured in the simulator",
         "benchmark ranking": "imagined success of policies against their real success",
         "benchmark policy": "success of a policy in an environment of your own, and what that measures beside it",
-        "reproduce roboscape": "Table 1, Figures 2 and 3 of RoboScape-R at this size, with every control",
+        "reproduce roboscape": "Tables 1 and 2, Figures 2, 3, 4 and 9 of RoboScape-R at this size, with every control",
         "benchmark clones": "success of cloned policies by what they see and by the number of demonstrations",
         "benchmark disc-base": "the video model that experiments on the moving disc begin with",
         "benchmark diversity": "diversity on the moving disc, at equal quality and noise budget",
