@@ -9,14 +9,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from rich.console import Console
 
 from benchmarks.video_rl import cost
 from benchmarks.video_rl.clock import clocked
-from benchmarks.video_rl.comparison import GAINS, compare_samplers, gains, paired_interval, value
+from benchmarks.video_rl.comparison import GAINS, compare_samplers, gains, value
 from benchmarks.video_rl.cost import ANCHORS, toy_rollout
 from benchmarks.video_rl.learning import alarms, hacked, train_on_discs
 from benchmarks.video_rl.samplers import LEARNER, DiscPlan, SamplerSetup, dyndiff, learning_samplers, sampler_setup
@@ -37,22 +36,6 @@ def training(sampler: str, seed: int, *rewards: float) -> dict[str, Any]:
 
 
 # intervals
-
-
-def test_the_interval_of_three_pairs_is_the_one_worked_by_hand() -> None:
-    """Differences 1, 2, 3: mean 2, standard deviation 1, t(2) = 4.303."""
-    found = paired_interval([1.0, 2.0, 3.0])
-    assert (found.mean, found.low, found.high) == pytest.approx((2.0, 2 - 4.303 / 3**0.5, 2 + 4.303 / 3**0.5))
-    assert not found.separable and paired_interval([1.0, 1.1, 0.9]).separable
-    with pytest.raises(ValueError, match="got 1"):
-        paired_interval([1.0])
-
-
-def test_the_interval_of_noise_covers_its_mean_in_19_cases_of_20() -> None:
-    generator = np.random.default_rng(0)
-    for pairs in (3, 8, 12):
-        covered = sum(not paired_interval(generator.normal(size=pairs).tolist()).separable for _ in range(2000))
-        assert covered / 2000 == pytest.approx(0.95, abs=0.017)
 
 
 def test_arms_are_compared_on_their_common_seeds_over_the_path_and_at_the_end() -> None:

@@ -3,12 +3,14 @@
 import itertools
 import math
 
+import numpy as np
 import pytest
 
 from wm_nodes.core.statistics import (
     mcnemar_exact,
     newcombe_difference,
     paired_difference,
+    t_interval,
     wilson_interval,
 )
 
@@ -94,3 +96,19 @@ def test_paired_lengths_must_match() -> None:
         paired_difference([True], [True, False])
     with pytest.raises(ValueError, match="not empty"):
         paired_difference([], [])
+
+
+def test_the_interval_of_three_values_is_the_one_worked_by_hand() -> None:
+    """Differences 1, 2, 3: mean 2, standard deviation 1, t(2) = 4.303."""
+    found = t_interval([1.0, 2.0, 3.0])
+    assert (found.mean, found.low, found.high) == pytest.approx((2.0, 2 - 4.303 / 3**0.5, 2 + 4.303 / 3**0.5))
+    assert not found.separable and t_interval([1.0, 1.1, 0.9]).separable
+    with pytest.raises(ValueError, match="got 1"):
+        t_interval([1.0])
+
+
+def test_the_interval_of_noise_covers_its_mean_in_19_cases_of_20() -> None:
+    generator = np.random.default_rng(0)
+    for pairs in (3, 8, 12):
+        covered = sum(not t_interval(generator.normal(size=pairs).tolist()).separable for _ in range(2000))
+        assert covered / 2000 == pytest.approx(0.95, abs=0.017)

@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from benchmarks.video_rl.comparison import paired_interval
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import file_sha256
 from wm_nodes.core.model_folder import files_sha256
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.core.statistics import paired_difference, wilson_interval
+from wm_nodes.core.statistics import paired_difference, t_interval, wilson_interval
 from wm_nodes.core.types import Environment
 from wm_nodes.policy_rl.factories import (
     load_policy,
@@ -246,5 +245,5 @@ def rate_over_seeds(rates: Sequence[float]) -> str:
     text = f"{fmean(rates):.1f}"
     if len(rates) == 1:
         return text
-    over = paired_interval(rates)
+    over = t_interval(rates)
     return f"{text} ({max(0.0, over.low):.1f} to {min(100.0, over.high):.1f})"

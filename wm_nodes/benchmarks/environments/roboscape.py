@@ -18,7 +18,6 @@ from benchmarks.environments.learned_rewards import EMBEDDING, PROXY, Learned, e
 from benchmarks.environments.policies import SIMULATOR, WORLD_MODEL, Workplace, rate_of, rate_over_seeds, train_on
 from benchmarks.environments.reward_test import measure_rewards, rewards_table
 from benchmarks.experiment import Count, console
-from benchmarks.video_rl.comparison import paired_interval
 from wm_nodes.apps.seed_study import mean_gain
 from wm_nodes.config.load import load_config
 from wm_nodes.config.scenes import draw, splits
@@ -26,6 +25,7 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import part_of, parts_of
 from wm_nodes.core.model_folder import files_sha256
 from wm_nodes.core.progress import tqdm
+from wm_nodes.core.statistics import t_interval
 from wm_nodes.policy_rl.model_refresh import RefreshDecision, refresh_round, round_folder
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.training.weights import save_weights
@@ -249,7 +249,7 @@ def gain(rows: Iterable[dict[str, Any]], base: str, training: str = MODEL) -> st
         return ""
     text = f"{fmean(of_seeds):+.1f}"
     if len(of_seeds) > 1:
-        over = paired_interval(of_seeds)
+        over = t_interval(of_seeds)
         text = f"{text} ({over.low:+.1f} to {over.high:+.1f} over {len(of_seeds)} seeds)"
     return text
 

@@ -17,9 +17,8 @@ from rich.table import Table
 from benchmarks.experiment import Count, Experiment, console
 from benchmarks.judge.call_counter import CountingJudge
 from benchmarks.judge.label_judge import ClipLabels, Errors, LabelJudge
-from benchmarks.video_rl.comparison import Difference, paired_interval
 from wm_nodes.core.progress import tqdm
-from wm_nodes.core.statistics import balanced_accuracy
+from wm_nodes.core.statistics import balanced_accuracy, t_interval
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.types import Status
@@ -189,7 +188,7 @@ def _gain(clip: LabelledClip, before: Judged, after: Judged) -> dict[str, float]
 
 
 def interval(values: Sequence[float]) -> tuple[float, float, float]:
-    found: Difference = paired_interval(values)
+    found = t_interval(values)
     return found.mean, found.low, found.high
 
 

@@ -4,8 +4,7 @@ from collections import Counter
 from statistics import mean
 
 from benchmarks.tables.table import Rows, Run, lines, percent, points, read, share
-from benchmarks.video_rl.comparison import paired_interval
-from wm_nodes.core.statistics import paired_difference
+from wm_nodes.core.statistics import paired_difference, t_interval
 
 STUDY, ARMS = "policy_rl_seed_study.jsonl", "policy_rl_against_exploiting.json"
 LIKELIHOOD, CONTROL = "policy_rl_likelihood.json", "policy_rl_scenes.json"
@@ -19,7 +18,7 @@ def push_cube() -> Rows:
             one["task"], one["seed"], *rates, points(one["success_before"], one["success_after"]),
             percent(rate(one["imagined_after"])), one["acceptance"]["outcome"],
         )
-    whole = paired_interval([100 * rate(one["real_after"]) for one in found])
+    whole = t_interval([100 * rate(one["real_after"]) for one in found])
     first, last = ([x for one in found for x in one[f"success_{when}"]] for when in ("before", "after"))
     yield (
         "push_cube", "all", percent(mean(first)), f"{whole.mean:.1f} [{whole.low:.1f}, {whole.high:.1f}]",

@@ -3,12 +3,16 @@
 from collections.abc import Sequence
 from itertools import product
 from statistics import fmean
+from typing import get_args
 
+from benchmarks.environments.clones import TASKS as CLONED
+from benchmarks.environments.clones import Inputs
 from benchmarks.environments.roboscape import (
     ALL_SCENES,
     FIGURE_2,
     GOAL,
     LABELS,
+    MANY,
     MODEL,
     ONE_SCENE,
     PAPER,
@@ -21,10 +25,16 @@ from benchmarks.environments.roboscape import (
     success_of,
 )
 from benchmarks.tables.table import Rows, Run, interval, read
-from benchmarks.video_rl.comparison import paired_interval
 from wm_nodes.config.scenes import splits
+from wm_nodes.config.tasks import parts_of
+from wm_nodes.core.statistics import t_interval
 
 REWARDS, TRAINED = "roboscape_rewards.json", ("roboscape_table1.json", "roboscape_more.json")
+PPO, CLONES, EXTREME, SEVERAL = (
+    f"roboscape_{name}.json" for name in ("ppo", "clones", "extreme_actions", "table2")
+)
+AFTER = 1, 8, 32
+"""Steps of a rollout at which its pictures are compared."""
 DOMAINS = "IND", "OOD"
 POSITIONS = "positions"
 OURS = "reach_object"
@@ -73,7 +83,7 @@ def figure_2() -> Rows:
             differences = [success_of(row, "OOD") - base[row["seed"]] for row in of]
             apart = "" if training == MODEL else f"{fmean(differences):+.1f}"
             if apart and len(of) > 1:
-                over = paired_interval(differences)
+                over = t_interval(differences)
                 apart = interval(over.mean, over.low, over.high, 1)
             yield PAYS[training], *(by_seed([success_of(row, domain) for row in of]) for domain in DOMAINS), apart
 
@@ -92,6 +102,46 @@ def rewards() -> Rows:
             *("/".join(form.format(of[domain][name]) for domain in splits())
               for name, form in (("auroc_empty_hand", "{:.2f}"), ("rank_correlation", "{:+.2f}"))),
         )
+
+
+def ppo_settings() -> Rows:
+    """The preset's row first; of the others what differs from it."""
+    runs = [row for row in read(PPO)["rows"] if row["model"] == MODEL]
+    base = runs[0]["config"]
+    for row in runs:
+        changed = [f"{part}.{name} {value}" for part, values in row["config"].items()
+                   for name, value in values.items() if value != base[part][name]]
+        yield (
+            ", ".join(changed) or "preset", *(f"{success_of(row, domain):.1f}" for domain in DOMAINS),
+            f"{100 * row['course'][-1]:.1f}",
+        )
+
+
+def clones() -> Rows:
+    found = read(CLONES)["rows"]
+    for task, seen in product(CLONED, get_args(Inputs)):
+        of = {row["config"]["sft"]["num_demonstrations"]: row["success"] for row in found
+              if (row["task"], row["config"]["policy"]["inputs"]) == (task, seen)}
+        for count, success in sorted(of.items()):
+            yield task, seen, count, *(f"{100 * success[split]['rate']:.1f}" for split in splits())
+
+
+def extreme() -> Rows:
+    for row in read(EXTREME)["rows"]:
+        drops = (row["metrics"][f"psnr_shuffled_drop_db_h{step:02d}"] for step in AFTER)
+        yield row["task"], row["domain"], row["actions"], row["episodes"], *(f"{drop:+.2f}" for drop in drops)
+
+
+def table_2() -> Rows:
+    of = {row["model"]: row for row in read(SEVERAL)["rows"]}
+    for part in parts_of(MANY):
+        for training, row in of.items():
+            rates = [success_of(row, domain, part) for domain in DOMAINS]
+            less = [rate - success_of(of[SFT], domain, part) for rate, domain in zip(rates, DOMAINS, strict=True)]
+            yield (
+                part, LABELS[training], *(f"{rate:.1f}" for rate in rates),
+                *("" if training == SFT else f"{difference:+.1f}" for difference in less),
+            )
 
 
 def openvla_size() -> Rows:

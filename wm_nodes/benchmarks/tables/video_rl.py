@@ -5,8 +5,8 @@ from itertools import groupby
 from statistics import mean, median
 
 from benchmarks.tables.table import Rows, Run, interval, lines, percent, read
-from benchmarks.video_rl.comparison import gains, paired_interval
-from wm_nodes.core.statistics import bootstrap_mean
+from benchmarks.video_rl.comparison import gains
+from wm_nodes.core.statistics import bootstrap_mean, t_interval
 
 LEARNING, ABLATIONS, CLIP_LEARNING = (f"video_rl_{name}.json" for name in ("learning", "ablations", "clip_learning"))
 AS_WRITTEN = "video_rl_as_written.json"
@@ -58,7 +58,7 @@ def gained(trained: Sequence[Run], measures: Sequence[tuple[str, int]]) -> list[
 def over_seeds(changes: Sequence[float], digits: int) -> str:
     if len(changes) < 2:
         return f"{changes[0]:+.{digits}f}"
-    found = paired_interval(changes)
+    found = t_interval(changes)
     return interval(found.mean, found.low, found.high, digits)
 
 
@@ -145,10 +145,10 @@ def as_written() -> Rows:
     for other in others:
         pairs = list(zip(trainings[first], trainings[other], strict=True))  # one seed each
         apart = [
-            paired_interval([of_buffers(one, measure, LAST) - of_buffers(base, measure, LAST) for one, base in pairs])
+            t_interval([of_buffers(one, measure, LAST) - of_buffers(base, measure, LAST) for one, base in pairs])
             for measure in ("reward_mean", "rollout_diversity")
         ] + [
-            paired_interval([one["evaluations"][-1][name] - base["evaluations"][-1][name] for one, base in pairs])
+            t_interval([one["evaluations"][-1][name] - base["evaluations"][-1][name] for one, base in pairs])
             for name in ("success", "outcome")
         ]
         cells = [interval(one.mean, one.low, one.high, 3) for one in apart]

@@ -1,35 +1,18 @@
 """Two ways of training, compared on the same seeds: mean paired difference with Student's 95 % interval."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from wm_nodes.video_rl.reward_hacking import T_975
+from wm_nodes.core.statistics import MeanInterval, t_interval
 
 PATH = "_path"
 """Ending of a measure that is a mean over the evaluations of a training, its area per model call, and not the last."""
 MEASURES = ("reward_path", "reward", "obeyed", "background")
 GAINS = ("reward", "task", "obeyed", "mass", "background")
 CLIP_MEASURES = ("tracking_path", "tracking", "object_cm", "tool_cm", "psnr_db")
-
-
-@dataclass(frozen=True)
-class Difference:
-    """Mean over seeds of one measure: sampler - base, or after - before."""
-
-    mean: float
-    """Over the seeds."""
-    low: float
-    """Of the 95 % interval."""
-    high: float
-    """Of the 95 % interval."""
-
-    @property
-    def separable(self) -> bool:
-        return not self.low <= 0 <= self.high
 
 
 @dataclass(frozen=True)
@@ -42,7 +25,7 @@ class SamplerComparison:
     """The name of the other."""
     seeds: tuple[int, ...]
     """That both were trained at."""
-    differences: dict[str, Difference]
+    differences: dict[str, MeanInterval]
     """One per measure."""
 
 
@@ -56,7 +39,7 @@ def compare_samplers(
     if len(seeds) < 2:
         return None
     differences = {
-        measure: paired_interval([value(of[sampler][seed], measure) - value(of[base][seed], measure) for seed in seeds])
+        measure: t_interval([value(of[sampler][seed], measure) - value(of[base][seed], measure) for seed in seeds])
         for measure in measures
     }
     return SamplerComparison(sampler, base, tuple(seeds), differences)
@@ -74,13 +57,3 @@ def value(row: dict[str, Any], measure: str) -> float:
     if name != measure:
         return float(np.mean([evaluation[name] for evaluation in evaluations[1:]]))
     return float(evaluations[-1][measure])
-
-
-def paired_interval(differences: Sequence[float]) -> Difference:
-    """Return mean -+ t s / sqrt(n), s with n - 1. Raises ValueError: fewer than two differences."""
-    n = len(differences)
-    if n < 2:
-        raise ValueError(f"an interval needs at least two pairs, got {n}; train more seeds")
-    mean, spread = float(np.mean(differences)), float(np.std(differences, ddof=1))
-    half = T_975[min(n - 1, len(T_975)) - 1] * spread / math.sqrt(n)
-    return Difference(mean, mean - half, mean + half)

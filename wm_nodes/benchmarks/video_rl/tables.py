@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from benchmarks.video_rl.comparison import GAINS, Difference, SamplerComparison, gains, paired_interval
+from benchmarks.video_rl.comparison import GAINS, SamplerComparison, gains
 from benchmarks.video_rl.learning import alarms
-from wm_nodes.core.statistics import bootstrap_mean
+from wm_nodes.core.statistics import MeanInterval, bootstrap_mean, t_interval
 from wm_nodes.reports.console_table import estimate, make_table
 
 SCORES = ("tracking", "object_cm", "tool_cm", "psnr_db")
@@ -161,9 +161,9 @@ def _regime(row: dict[str, Any]) -> str:
 
 
 def _change_text(changes: Sequence[float]) -> str:
-    return _difference_text(paired_interval(changes)) if len(changes) > 1 else f"{changes[0]:+.4f}"
+    return _difference_text(t_interval(changes)) if len(changes) > 1 else f"{changes[0]:+.4f}"
 
 
-def _difference_text(difference: Difference) -> str:
+def _difference_text(difference: MeanInterval) -> str:
     star = "*" if difference.separable else ""
     return f"{difference.mean:+.4f} ({difference.low:+.4f}, {difference.high:+.4f}){star}"

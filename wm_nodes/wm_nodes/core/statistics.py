@@ -16,7 +16,25 @@ from wm_nodes.core.seeding import numpy_stream
 
 Z_95 = 1.959963984540054
 """Two-sided 95 % quantile of the standard normal distribution."""
+T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
+"""97.5 % quantile of Student's t for 1 to 9 degrees of freedom; the last serves more of them, a little wide."""
 NAN = float("nan")
+
+
+@dataclass(frozen=True)
+class MeanInterval:
+    """Of a few values, such as the seeds' difference of one measure."""
+
+    mean: float
+    """Of the values."""
+    low: float
+    """Of Student's 95 % interval."""
+    high: float
+    """Of Student's 95 % interval."""
+
+    @property
+    def separable(self) -> bool:
+        return not self.low <= 0 <= self.high
 
 
 @dataclass(frozen=True)
@@ -41,6 +59,21 @@ class PairedDifference:
     """Upper end of that interval."""
     mcnemar_p: float
     """p of the exact two-sided binomial test of lost against gained."""
+
+
+def t_interval(values: Sequence[float]) -> MeanInterval:
+    """Return mean -+ t s / sqrt(n), s with n - 1. Raises ValueError: fewer than two values."""
+    n = len(values)
+    if n < 2:
+        raise ValueError(f"an interval needs at least two values, got {n}; train more seeds")
+    mean, spread = float(np.mean(values)), float(np.std(values, ddof=1))
+    half = t_975(n - 1) * spread / math.sqrt(n)
+    return MeanInterval(mean, mean - half, mean + half)
+
+
+def t_975(freedom: int) -> float:
+    """97.5 % quantile of Student's t, see T_975."""
+    return T_975[min(freedom, len(T_975)) - 1]
 
 
 def wilson_interval(successes: float, episodes: float, *, z: float = Z_95) -> tuple[float, float]:

@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from wm_nodes.core.statistics import t_975
 from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, ClipScores, more_is_better
 
 SECTION = "heldout"
 """Of metrics.jsonl: scores by name, mean over the contexts, at the number of buffers trained on."""
 WATCHED = (*ClipScores.__dataclass_fields__, *PICTURE_SCORES)
-T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
-"""97.5 % quantile of Student's t for 1 to 9 degrees of freedom; the last serves more of them, a little wide."""
 
 
 def find_hacked_metrics(proxy: Sequence[float], held_out: Mapping[str, Sequence[float]]) -> dict[str, float]:
@@ -28,7 +27,7 @@ def find_hacked_metrics(proxy: Sequence[float], held_out: Mapping[str, Sequence[
         proxy: the training reward at each of n >= 3 evaluations. held_out: true metrics at the same ones, more is
             better.
     """
-    widths = T_975[min(len(proxy) - 2, len(T_975)) - 1]
+    widths = t_975(len(proxy) - 2)
     rise, rise_error = slope(proxy)
     if rise <= widths * rise_error:
         return {}
