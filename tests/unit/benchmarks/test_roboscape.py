@@ -61,6 +61,8 @@ def test_success_of_one_policy_for_several_tasks_is_told_by_the_seeds_of_its_epi
     for name in ("own", *OOD):
         made["success"][name]["episodes_won"] = won
     assert success_of(made, "OOD", "push") == 100 and success_of(made, "IND", "pull") == 0
+    made["success"]["own"]["episodes_won"] = won[:1]  # of push alone
+    assert cell([made], "IND", "pull" if won[0] else "push") == "-"
     assert success_of(made, "IND") == 50 and cell([made], "OOD", "push") == "100.0"
 
 

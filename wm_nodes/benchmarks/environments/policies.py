@@ -241,9 +241,9 @@ def rate_of(result: EvaluationResult) -> dict[str, float]:
             "high": high}
 
 def rate_over_seeds(rates: Sequence[float]) -> str:
-    """Mean of percentages, with its t interval (inside 0 to 100) where there are several."""
-    text = f"{fmean(rates):.1f}"
-    if len(rates) == 1:
+    """Mean of percentages, with its t interval (inside 0 to 100) where there are several; "-" for NaN."""
+    text = f"{fmean(rates):.1f}".replace("nan", "-")
+    if len(rates) == 1 or text == "-":
         return text
     over = t_interval(rates)
     return f"{text} ({max(0.0, over.low):.1f} to {min(100.0, over.high):.1f})"
