@@ -25,6 +25,7 @@ from wm_nodes.core.seeding import numpy_stream, torch_stream
 from wm_nodes.core.statistics import auroc
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.environments.record import collect_plan, task_plan
+from wm_nodes.judge.agent.contract import MAX_INVALID_SHARE
 from wm_nodes.judge.agent.types import TaskSpec, clip_ref
 from wm_nodes.judge.episode_reward import episode_judge
 from wm_nodes.judge.service import ClipJob, JudgeService
@@ -195,18 +196,24 @@ def paid(
 
 
 def judged(found: Imagined, config: RunConfig) -> NDArray[np.float64]:
-    """What the reward agent pays, at the last step of an episode (E, T); 0 where it gives no verdict, as where it says
-    no. By default the embedded judge, which learned from recordings in which nothing is wrong.
+    """What the reward agent pays, at the last step of an episode (E, T). By default the embedded judge, which learned
+    from recordings in which nothing is wrong.
+
+    Raises:
+        ValueError: it gives no verdict on more than MAX_INVALID_SHARE of them; on fewer, they are paid 0.
     """
     settings, jobs = episode_judge(config), list[ClipJob]()
-    period = 1 / config.simulation.control_hz
     for row, steps in enumerate(map(int, found.real.lengths)):
         frames = found.frames[row, : steps + 1]
         task = TaskSpec(found.real.instructions[row], config.task, settings.robot, frames[0], None,
                         found.real.actions[row, :steps])
-        jobs.append(ClipJob(clip_ref(f"episode {row}", frames, period), task))
+        jobs.append(ClipJob(clip_ref(f"episode {row}", frames, config.simulation.control_hz), task))
     with closing(JudgeService(settings, seed=config.seed, device=config.device)) as judge:
         verdicts = judge.judge(jobs)
+    silent = [verdict for verdict in verdicts if not verdict.valid]
+    if len(silent) > MAX_INVALID_SHARE * len(verdicts):
+        raise ValueError(f"the reward agent gives no verdict on {len(silent)} of {len(verdicts)} episodes: "
+                         f"{silent[0].status} {silent[0].reason}; mend the judge, see --judge.*")
     rewards = np.array([verdict.reward if verdict.valid else 0.0 for verdict in verdicts])
     at_end = np.arange(found.real.num_steps) >= found.real.lengths[:, None] - 1
     return np.where(at_end, rewards[:, None], 0.0)

@@ -24,7 +24,7 @@ from benchmarks.environments.roboscape import (
     gain,
     success_of,
 )
-from benchmarks.tables.table import Rows, Run, interval, read
+from benchmarks.tables.table import Rows, Run, interval, percent, read
 from wm_nodes.config.scenes import splits
 from wm_nodes.config.tasks import parts_of
 from wm_nodes.core.statistics import t_interval
@@ -120,10 +120,15 @@ def ppo_settings() -> Rows:
 def clones() -> Rows:
     found = read(CLONES)["rows"]
     for task, seen in product(CLONED, get_args(Inputs)):
-        of = {row["config"]["sft"]["num_demonstrations"]: row["success"] for row in found
-              if (row["task"], row["config"]["policy"]["inputs"]) == (task, seen)}
-        for count, success in sorted(of.items()):
-            yield task, seen, count, *(f"{100 * success[split]['rate']:.1f}" for split in splits())
+        of = [row for row in found if (row["task"], row["config"]["policy"]["inputs"]) == (task, seen)]
+        for count in sorted({row["config"]["sft"]["num_demonstrations"] for row in of}):
+            its = {bool(row["config"]["sft"]["heldout"]): row["success"] for row in of
+                   if row["config"]["sft"]["num_demonstrations"] == count}
+            yield (
+                task, seen, count,
+                *(percent(its[early][split]["rate"]) if early in its else "" for early in (False, True)
+                  for split in splits()),
+            )
 
 
 def extreme() -> Rows:
