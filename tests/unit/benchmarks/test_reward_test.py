@@ -15,6 +15,7 @@ from benchmarks.environments.reward_test import (
     goals_of,
     imagine_all,
     judge_reward,
+    judged,
     largest,
     learned_heads,
     paid,
@@ -70,6 +71,16 @@ def test_nothing_is_paid_after_the_done_signal_nor_after_the_end(folder: Path, f
     sums = paid(replace(found, signals=signals), None, folder, CONFIG)["done signal"]
     assert sums[0].tolist() == [0, 1, 1, 1, 1] and not sums[1:].any()
     assert goals_of(models_of(folder), found.real, CONFIG) is None, "no text model, no goal"
+
+
+def test_the_agent_pays_at_the_end_of_an_episode_and_its_silence_is_an_error(found: Imagined) -> None:
+    found = replace(found, real=replace(found.real, instructions=("push the cube to the goal",) * EPISODES))
+    paid_by_it = judged(found, CONFIG)
+    assert paid_by_it.shape == (EPISODES, STEPS) and (paid_by_it[:, -1] > 0).all()
+    assert not paid_by_it[:-1, :-1].any() and not paid_by_it[-1, : STEPS - 3].any() and paid_by_it[-1, STEPS - 3] > 0
+    slow = CONFIG.with_values(simulation=CONFIG.simulation.with_values(control_hz=1.0))
+    with pytest.raises(ValueError, match=rf"no verdict on {EPISODES} of {EPISODES} episodes: .*frames per second"):
+        judged(found, slow)
 
 
 def test_learned_rewards_tell_what_they_were_shown(
