@@ -7,6 +7,7 @@ from typing import get_args
 
 from benchmarks.environments.clones import TASKS as CLONED
 from benchmarks.environments.clones import Inputs
+from benchmarks.environments.reward_test import shown
 from benchmarks.environments.roboscape import (
     ALL_SCENES,
     FIGURE_2,
@@ -30,8 +31,8 @@ from wm_nodes.config.tasks import parts_of
 from wm_nodes.core.statistics import t_interval
 
 REWARDS, TRAINED = "roboscape_rewards.json", ("roboscape_table1.json", "roboscape_more.json")
-PPO, CLONES, EXTREME, SEVERAL = (
-    f"roboscape_{name}.json" for name in ("ppo", "clones", "extreme_actions", "table2")
+PPO, CLONES, EXTREME, SEVERAL, UNAIDED = (
+    f"roboscape_{name}.json" for name in ("ppo", "clones", "extreme_actions", "table2", "no_positions")
 )
 AFTER = 1, 8, 32
 """Steps of a rollout at which its pictures are compared."""
@@ -99,8 +100,8 @@ def rewards() -> Rows:
         of = {one["domain"]: one for one in found if (one["task"], one["reward"]) == (task, reward)}
         yield (
             task, reward, *("{:.2f} [{:.2f}, {:.2f}]".format(*of[domain]["auroc"]) for domain in splits()),
-            *("/".join(form.format(of[domain][name]) for domain in splits())
-              for name, form in (("auroc_empty_hand", "{:.2f}"), ("rank_correlation", "{:+.2f}"))),
+            *("/".join(shown(of[domain][name], form) for domain in splits())
+              for name, form in (("auroc_empty_hand", ".2f"), ("rank_correlation", "+.2f"))),
         )
 
 
@@ -135,6 +136,16 @@ def extreme() -> Rows:
     for row in read(EXTREME)["rows"]:
         drops = (row["metrics"][f"psnr_shuffled_drop_db_h{step:02d}"] for step in AFTER)
         yield row["task"], row["domain"], row["actions"], row["episodes"], *(f"{drop:+.2f}" for drop in drops)
+
+
+def no_positions() -> Rows:
+    for row in read(UNAIDED)["rows"]:
+        imagined = [100 * row["course"][place] for place in (0, -1)] if row["course"] else []
+        yield (
+            LABELS[row["model"]], *(f"{success_of(row, domain):.1f}" for domain in DOMAINS),
+            " → ".join(f"{rate:.1f}" for rate in imagined),
+            f"{row['acceptance']['outcome']}: {', '.join(row['acceptance']['failed'])}" if "acceptance" in row else "",
+        )
 
 
 def table_2() -> Rows:
