@@ -27,6 +27,8 @@ from wm_nodes.nodes.viewer.feed import PER_STEP, TABLE_S, TYPES, VIEW
 from wm_nodes.reports.live_page import LivePage
 
 pytestmark = [pytest.mark.graph, pytest.mark.kills, pytest.mark.slow]
+UPDATES = 8
+"""A few seconds: what comes before the viewer and a node have found each other is lost."""
 NODES = {f"/wm/{name}" for name in ("environment", "policy", "reward_evaluator", "learner")}
 
 
@@ -49,11 +51,11 @@ def read_panels(url: str, until: Any) -> dict[str, Any]:
 
 
 def is_whole(panels: dict[str, Any]) -> bool:
-    """Whether a picture, every node and the loss of both updates have come."""
+    """Whether a picture, every node and the loss of all updates have come."""
     return (
         panels.keys() >= {"pictures /wm", "charts", "nodes", "run"}
         and [len(line["points"]) for chart in panels["charts"]["charts"] for line in chart["lines"]
-             if chart["title"].startswith("value loss")] == [2]
+             if chart["title"].startswith("value loss")] == [UPDATES]
         and {row["node"] for row in panels["nodes"]["rows"]} >= NODES
     )
 
@@ -101,7 +103,7 @@ def test_a_training_is_shown_and_ends_with_the_same_weights_where_the_viewer_is_
                 if viewed:
                     looking = browser.submit(read_panels, url, is_whole)
                     wait_until("the viewer's steps", partial(takes_steps, probe))
-                assert train(probe, updates=2).termination_reason == Train.Result.FINISHED
+                assert train(probe, updates=UPDATES).termination_reason == Train.Result.FINISHED
                 if viewed:
                     panels = looking.result()
                     assert panels["pictures /wm"]["environment"] == "toy/reach" and panels["pictures /wm"]["picture"]
@@ -109,14 +111,14 @@ def test_a_training_is_shown_and_ends_with_the_same_weights_where_the_viewer_is_
                     assert "/wm/viewer" not in {row["node"] for row in panels["nodes"]["rows"]}
                     graph.processes["/wm/viewer"].send_signal(signal.SIGKILL)
                 result = train(probe, updates=2)
-                assert (result.termination_reason, result.updates) == (Train.Result.FINISHED, 4), result.message
+                assert (result.termination_reason, result.updates) == (Train.Result.FINISHED, UPDATES + 2), result.message
                 losses = [text for texts in probe.seen_errors.values() for text in texts]
                 assert losses == [], "nobody misses the viewer"
                 weights.append(weights_in(graph.folder))
             finally:
                 graph.stop()
                 probe.close()
-    assert weights[0] == weights[1] and len(weights[0]) == 5
+    assert weights[0] == weights[1] and len(weights[0]) == UPDATES + 3
 
 
 def test_the_viewer_takes_steps_and_pictures_only_while_somebody_looks_and_curves_always(

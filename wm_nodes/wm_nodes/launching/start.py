@@ -8,9 +8,9 @@ from wm_nodes.core.interrupts import leaving_when_interrupted
 
 def start(scenario: str) -> int:
     """Run a scenario with the arguments of the command line; return the exit code."""
-    with leaving_when_interrupted():
-        from wm_nodes.launching.runner import main
     try:
+        with leaving_when_interrupted():
+            from wm_nodes.launching.runner import main
         return main(scenario)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
