@@ -113,7 +113,7 @@ def ppo_settings() -> Rows:
         changed = [f"{part}.{name} {value}" for part, values in row["config"].items()
                    for name, value in values.items() if value != base[part][name]]
         yield (
-            ", ".join(changed) or "preset", *(f"{success_of(row, domain):.1f}" for domain in DOMAINS),
+            row["seed"], ", ".join(changed) or "preset", *(f"{success_of(row, domain):.1f}" for domain in DOMAINS),
             f"{100 * row['course'][-1]:.1f}",
         )
 
