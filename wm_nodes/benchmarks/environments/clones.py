@@ -4,13 +4,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 from benchmarks.environments.experiments import Configured
 from benchmarks.environments.policies import SIMULATOR, Workplace, rate_of, rate_over_seeds
 from benchmarks.experiment import Count, console
 from wm_nodes.config.load import load_config
 from wm_nodes.config.scenes import splits
+from wm_nodes.config.schema import PolicyInputs
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.progress import tqdm
 from wm_nodes.environments.record import collect_plan, demonstration_plan
@@ -18,7 +19,6 @@ from wm_nodes.policy_rl.initial_policy import train_weak_policy
 from wm_nodes.reports.console_table import make_table
 
 TASKS = ("push", "pull", "pick_place", "move_to_aim", "reach_object")
-Inputs = Literal["latents", "positions", "both"]
 CLONE = "clone"
 
 
@@ -31,7 +31,7 @@ class Clones(Configured):
     """Of the settings: a name, or a .yaml."""
     tasks: tuple[str, ...] = TASKS
     """Each has demonstrations of its own."""
-    inputs: tuple[Inputs, ...] = get_args(Inputs)
+    inputs: tuple[PolicyInputs, ...] = get_args(PolicyInputs)
     """What the policy sees, values of policy.inputs."""
     demonstrations: tuple[Count, ...] = (10, 25, 100, 400)
     """Numbers of them; a smaller number has the first of the largest."""

@@ -6,7 +6,6 @@ from statistics import fmean
 from typing import get_args
 
 from benchmarks.environments.clones import TASKS as CLONED
-from benchmarks.environments.clones import Inputs
 from benchmarks.environments.reward_test import shown
 from benchmarks.environments.roboscape import (
     ALL_SCENES,
@@ -27,6 +26,7 @@ from benchmarks.environments.roboscape import (
 )
 from benchmarks.tables.table import Rows, Run, interval, percent, read
 from wm_nodes.config.scenes import splits
+from wm_nodes.config.schema import PolicyInputs
 from wm_nodes.config.tasks import parts_of
 from wm_nodes.core.statistics import t_interval
 
@@ -120,7 +120,7 @@ def ppo_settings() -> Rows:
 
 def clones() -> Rows:
     found = read(CLONES)["rows"]
-    for task, seen in product(CLONED, get_args(Inputs)):
+    for task, seen in product(CLONED, get_args(PolicyInputs)):
         of = [row for row in found if (row["task"], row["config"]["policy"]["inputs"]) == (task, seen)]
         for count in sorted({row["config"]["sft"]["num_demonstrations"] for row in of}):
             its = {bool(row["config"]["sft"]["heldout"]): row["success"] for row in of
