@@ -80,9 +80,13 @@ class Stream:
     def spec(self, message: Any) -> None:
         spec, tiles = m.spec_of(message)
         self.size = tiles.tile_height, tiles.tile_width
-        self.about |= {"kind": SOURCES.get(spec.source, "real"), "imagined": spec.source == SOURCE_IMAGINED,
-                       "environment": spec.env_id, "cameras": spec.cameras, "steps": spec.max_episode_steps,
-                       "instruction": spec.instruction}
+        said = {"kind": SOURCES.get(spec.source, "real"), "imagined": spec.source == SOURCE_IMAGINED,
+                "environment": spec.env_id, "cameras": spec.cameras, "steps": spec.max_episode_steps,
+                "instruction": spec.instruction}
+        self.about |= said
+        if self._shown:  # pictures may come first: it is another topic
+            self._shown |= said
+            self._page.show(f"pictures {self._panel}", self._shown)
 
     def image(self, message: Any, size: tuple[int, int]) -> None:
         """size: height and width of environment 0 at the upper left, px."""
