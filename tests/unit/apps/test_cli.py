@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from benchmarks.experiment import EXPERIMENTS
-from wm_nodes.apps import cli
+from wm_nodes.apps import cli, options
 from wm_nodes.config.load import load_config
 from wm_nodes.core.errors import ModelNotAcceptedError, RunError
 from wm_nodes.reports.live_page import LivePage
@@ -131,6 +131,13 @@ def test_a_wrong_option_is_one_line_and_code_2(capsys: pytest.CaptureFixture[str
             cli.main(words)
         text = capsys.readouterr().err
         assert text.startswith("error: ") and text.count("\n") == 1 and f"see wm {words[0]}" in text
+
+
+@pytest.mark.parametrize("verb", ["train-video-model", "check-video-model"])
+def test_loop_2_takes_its_task_as_an_option(verb: str) -> None:
+    parser = cli.parser_of(verb, f"wm {verb}")
+    assert options.settings(parser.parse(["--task", "push"])) == {"task": "push"}
+    assert options.settings(parser.parse([])) == {}
 
 
 def test_a_misspelt_option_is_answered_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:

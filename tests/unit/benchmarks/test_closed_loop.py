@@ -20,7 +20,7 @@ from benchmarks.video_rl.closed_loop import (
     closed_loop_samplers,
     equal_compute,
 )
-from benchmarks.video_rl.controls import FlowMatchingLearner, RecordedTargets, kept_clips
+from benchmarks.video_rl.controls import BestAndRecorded, FlowMatchingLearner, RecordedTargets, best_and_worst
 from benchmarks.video_rl.samplers import SamplerSetup
 from benchmarks.video_rl.sources import config_of
 from wm_nodes.apps.cli import main
@@ -65,17 +65,32 @@ def folder(contexts: Clips) -> VideoFolder:
 
 
 def sampled(folder: VideoFolder, contexts: Clips, source: type[RecordedContexts] = RecordedContexts) -> RolloutBuffer:
+    torch.manual_seed(1)
     made = source(folder, contexts, CONFIG, PositionProbe(64, 128))
-    request = GroupRequest((0, 2), 3 if source is RecordedContexts else 1, 0, 0, 1)
+    request = GroupRequest((0, 2), 1 if source is RecordedTargets else 3, 0, 0, 1)
     return made.score(request, made.sample(request))
 
 
-def test_of_a_group_the_valid_clip_of_highest_reward_is_kept(folder: VideoFolder, contexts: Clips) -> None:
-    buffer = sampled(folder, contexts).with_rewards({"total": torch.tensor([1.0, 3, 2, torch.nan, -2, -1])})
-    assert kept_clips(buffer, "best").tolist() == [False, True, False, False, False, True]
-    assert kept_clips(buffer, "all").tolist() == [True, True, True, False, True, True]
-    none = buffer.with_rewards({"total": torch.tensor([1.0, 3, 2, *[torch.nan] * 3])})
-    assert kept_clips(none, "best").tolist() == [False, True, False, False, False, False]
+def test_of_each_group_the_best_and_another_row_are_found() -> None:
+    groups = torch.tensor([0, 0, 0, 2, 2, 2])
+    rewards = torch.tensor([1.0, 3, 2, torch.nan, -2, -1])
+    assert [rows.tolist() for rows in best_and_worst(rewards, groups)] == [[1, 5], [0, 3]]
+    for equal in (0.0, torch.nan):
+        best, worst = best_and_worst(torch.full((6,), equal), groups)
+        assert best.tolist() == [2, 5] and worst.tolist() == [0, 3]
+
+
+def test_the_best_clip_of_each_group_trains_and_the_recording_of_its_context(
+    folder: VideoFolder, contexts: Clips
+) -> None:
+    buffer, own = sampled(folder, contexts, BestAndRecorded), sampled(folder, contexts)
+    best, worst = best_and_worst(own.reward, own.group_ids)
+    assert torch.nonzero(buffer.valid)[:, 0].tolist() == sorted([*best.tolist(), *worst.tolist()])
+    assert torch.equal(buffer.rollout.latents[worst], folder.codec.encode(contexts.frames[[0, 2], 1:9]))
+    others = [row for row in range(6) if row not in worst]
+    assert torch.equal(buffer.rollout.latents[others], own.rollout.latents[others])
+    assert torch.equal(buffer.reward[best], own.reward[best]), "what it reports is what its own clips earn"
+    assert torch.equal(buffer.reward[worst], own.reward[best])
 
 
 def test_recorded_targets_are_the_recordings_after_the_models_own_frames(
@@ -89,19 +104,16 @@ def test_recorded_targets_are_the_recordings_after_the_models_own_frames(
     assert not torch.allclose(buffer.condition.frames, coded[:, :, :4], atol=0.1)
 
 
-@pytest.mark.parametrize("keep", ["all", "best"])
-def test_flow_matching_towards_what_is_kept_brings_the_model_nearer_to_it_and_equal_seeds_give_equal_bits(
-    keep: str, folder: VideoFolder, contexts: Clips
+def test_flow_matching_towards_valid_clips_brings_the_model_nearer_to_them_and_equal_seeds_give_equal_bits(
+    folder: VideoFolder, contexts: Clips
 ) -> None:
-    buffer = sampled(folder, contexts)
+    buffer = sampled(folder, contexts, BestAndRecorded)
     settings = CONFIG.grpo.with_values(updates_per_buffer=2, learning_rate=3e-2)
     learners, start = [], weights(folder.network)
     for _ in range(2):
         network = VideoNetwork(folder.network.settings)
         network.load_state_dict(start)
-        learners.append(FlowMatchingLearner(
-            network, settings, CONFIG.rollout, seed=0, keep=keep, draws=4  # type: ignore[arg-type]
-        ))
+        learners.append(FlowMatchingLearner(network, settings, CONFIG.rollout, seed=0, draws=4))
         again = (replace(buffer, policy_version=2 * i) for i in range(20))
         losses = [-update.objective for one in again for update in learners[-1].train(one).updates]
         assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:5])
@@ -109,13 +121,13 @@ def test_flow_matching_towards_what_is_kept_brings_the_model_nearer_to_it_and_eq
     first, second = (weights(learner.model) for learner in learners)
     assert all(torch.equal(first[name], second[name]) for name in first)
     report = learners[0].train(replace(buffer, policy_version=40))
-    assert report.kept == (6 if keep == "all" else 2) and report.updates[0].transitions == 2 * report.kept
+    assert report.kept == 4 and report.updates[0].transitions == 2 * report.kept
 
 
 def test_draws_are_spread_evenly(folder: VideoFolder) -> None:
     settings = CONFIG.grpo.with_values(updates_per_buffer=3)
     with pytest.raises(ValueError, match="4 draws cannot be spread over 3 updates"):
-        FlowMatchingLearner(tiny_network(), settings, CONFIG.rollout, seed=0, keep="all", draws=4)
+        FlowMatchingLearner(tiny_network(), settings, CONFIG.rollout, seed=0, draws=4)
 
 
 def arm_config(sampler: SamplerSetup) -> VideoRlConfig:
@@ -130,7 +142,7 @@ def test_arms_cost_the_same_network_calls() -> None:
     assert nft == {**calls["CPS 0.4"], "training": 384}, "the old weights are called, too"
     assert all(one == calls["CPS 0.4"] for one in calls.values()), calls
     config = arm_config(samplers["CPS 0.4"])
-    assert equal_compute(config, BEST) == (8, 12), "8 kept clips, 12 pairs each, 3 forwards a pair: 288"
+    assert equal_compute(config, BEST) == (8, 6), "8 clips and 8 recordings, 6 pairs each, 3 forwards a pair: 288"
     contexts, draws = equal_compute(config, RECORDINGS)
     assert contexts * (1.0 * 4 + draws * 3) == pytest.approx(576, rel=0.02)
 
@@ -158,7 +170,7 @@ def test_the_command_trains_every_arm_and_goes_on_where_its_file_stops(
         assert {"tool_cm_3", "psnr_db_1"} <= last.keys()
         assert row["before"] == rows[0]["before"] and row["after"] != row["before"]
     assert len({json.dumps(row["after"]) for row in rows}) == 3, "two arms are the same training"
-    for name in ("CPS_0.4_0", "best_of_n_0", "recordings_0"):
+    for name in ("CPS_0.4_0", "best_of_n_and_recordings_0", "recordings_0"):
         kept = load_video_folder(tmp_path / "kept" / name)
         assert kept.lengths == folder.lengths and kept.manifest["base"] == load_video_folder(model).sha256
         assert kept.manifest["post_training"]["seed"] == 0 and kept.sha256 != kept.manifest["base"]

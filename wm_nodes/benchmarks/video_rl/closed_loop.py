@@ -9,14 +9,14 @@ import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
 
 from benchmarks.experiment import Count, console
 from benchmarks.video_rl import tables
 from benchmarks.video_rl.comparison import SamplerComparison
-from benchmarks.video_rl.controls import TRAINING_CALLS, FlowMatchingLearner, RecordedTargets
+from benchmarks.video_rl.controls import TRAINING_CALLS, BestAndRecorded, FlowMatchingLearner, RecordedTargets
 from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers
 from benchmarks.video_rl.sources import TASK, RecordedSource, config_of
@@ -37,8 +37,8 @@ from wm_nodes.video_rl.sampling import sample_by_ode
 from wm_nodes.world_model.position_probe import PositionProbe
 
 PRESET, REWARDS = "closed_loop", {"tracking": 1.0}
-BEST, RECORDINGS = "best of n", "recordings"
-DRAWS, UPDATES = 4, 4
+BEST, RECORDINGS = "best of n and recordings", "recordings"
+DRAWS, UPDATES = 4, {BEST: 3, RECORDINGS: 4}
 """Of the controls: (time, noise) pairs per recorded clip; optimizer steps per buffer, which share the pairs."""
 MEASURES = ("error_cm", "error_cm_path", "win", "object_cm", "tool_cm", "psnr_db")
 SCORES = ("tracking", "object_cm", "tool_cm", "psnr_db", "scenery")
@@ -61,10 +61,10 @@ class ClosedLoopPlan(LearningPlan):
 
 def closed_loop_samplers() -> list[SamplerSetup]:
     """Group methods that train the same number of (clip, step) pairs (in a window of 2 of the 3 steps that can train,
-    half as many clips again), and the two controls: flow matching on each group's best clip, and on recordings."""
+    half as many clips again), and the two controls: flow matching on recordings, and on them and each group's best."""
     group = [_fill_window(one) if one.name.endswith("window") else one for one in outcome_samplers(PRESET)]
-    controls = group[0].grpo.with_values(updates_per_buffer=UPDATES)
-    return [*group, *(replace(group[0], name=name, grpo=controls) for name in (BEST, RECORDINGS))]
+    controls = {name: group[0].grpo.with_values(updates_per_buffer=steps) for name, steps in UPDATES.items()}
+    return [*group, *(replace(group[0], name=name, grpo=grpo) for name, grpo in controls.items())]
 
 
 def calls_of_buffer(config: VideoRlConfig) -> dict[str, float]:
@@ -84,8 +84,8 @@ def equal_compute(config: VideoRlConfig, control: str) -> tuple[int, int]:
     """Return contexts per buffer and (time, noise) pairs per clip that cost a control what a group method costs."""
     calls, contexts = calls_of_buffer(config), config.groups.contexts
     if control == BEST:
-        pairs = calls["training"] / (TRAINING_CALLS * contexts)
-        return contexts, max(1, round(pairs / UPDATES)) * UPDATES
+        pairs = calls["training"] / (TRAINING_CALLS * 2 * contexts)  # on the best clip, and on the recording
+        return contexts, max(1, round(pairs / UPDATES[BEST])) * UPDATES[BEST]
     each = calls["history"] / contexts + TRAINING_CALLS * DRAWS
     return round(sum(calls.values()) / each), DRAWS
 
@@ -116,6 +116,10 @@ class TargetSource(RecordedTargets, ClosedLoopSource):
     """Recordings in place of continuations, validated alike."""
 
 
+class BestSource(BestAndRecorded, ClosedLoopSource):
+    """Continuations with recordings among them, validated alike."""
+
+
 def train_arm(
     folder: VideoFolder, contexts: Clips, heldout: Clips, probe: PositionProbe, sampler: SamplerSetup,
     plan: ClosedLoopPlan, seed: int, on_iteration: Callable[[], object] = lambda: None,
@@ -124,15 +128,13 @@ def train_arm(
     config = config_of(sampler, plan, seed, PRESET, REWARDS)
     config = config.with_values(groups=config.groups.with_values(history=plan.history))
     learner: GrpoLearner | FlowMatchingLearner
-    calls, source = sum(calls_of_buffer(config).values()), ClosedLoopSource
+    source: type[ClosedLoopSource] = ClosedLoopSource
+    calls = sum(calls_of_buffer(config).values())
     if sampler.name in (BEST, RECORDINGS):
         count, draws = equal_compute(config, sampler.name)
         config = config.with_values(groups=config.groups.with_values(contexts=count))
-        keep: Literal["best", "all"] = "best" if sampler.name == BEST else "all"
-        source = ClosedLoopSource if sampler.name == BEST else TargetSource
-        learner = FlowMatchingLearner(
-            folder.network, sampler.grpo, sampler.rollout, seed=seed, keep=keep, draws=draws
-        )
+        source = BestSource if sampler.name == BEST else TargetSource
+        learner = FlowMatchingLearner(folder.network, sampler.grpo, sampler.rollout, seed=seed, draws=draws)
     else:
         learner = GrpoLearner(folder.network, sampler.grpo, sampler.rollout, seed=seed)
     made = source(folder, contexts, heldout, probe, config)

@@ -6,7 +6,6 @@ Compute is counted in forwards of one clip by the network; forward and backward 
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -23,25 +22,23 @@ from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
 TRAINING_CALLS = 3
 """Forwards that one forward and backward cost."""
 NAN = math.nan
-Kept = Literal["all", "best"]
 
 
 class FlowMatchingLearner:
-    """Trains `model` in place by flow matching on clips of a buffer; the interface is that of GrpoLearner.
+    """Trains `model` in place by flow matching on the valid clips of a buffer; the interface is that of GrpoLearner.
 
     Args:
         settings: learning_rate, weight_decay, max_grad_norm, updates_per_buffer are used.
-        keep: all valid clips, or of each group the one of highest reward.
         draws: (time, noise) pairs per kept clip and buffer, spread over the updates; a multiple of updates_per_buffer.
         seed: of times and noise (stream `flow_matching`).
     """
 
     def __init__(
-        self, model: VideoNetwork, settings: GrpoConfig, rollout: RolloutConfig, *, seed: int, keep: Kept, draws: int
+        self, model: VideoNetwork, settings: GrpoConfig, rollout: RolloutConfig, *, seed: int, draws: int
     ) -> None:
         if draws % settings.updates_per_buffer:
             raise ValueError(f"{draws} draws cannot be spread over {settings.updates_per_buffer} updates evenly")
-        self.model, self.settings, self.rollout, self.seed, self.keep = model, settings, rollout, seed, keep
+        self.model, self.settings, self.rollout, self.seed = model, settings, rollout, seed
         self.draws, self.version, self.iterations = draws, 0, 0
         self._flow = load_video_config("base").model.training.with_values(drop=0.0)
         self.parameters = [p for p in model.parameters() if p.requires_grad]
@@ -57,7 +54,7 @@ class FlowMatchingLearner:
             FloatingPointError: a gradient is not finite.
         """
         buffer.check(self.rollout, self.version)
-        rows = torch.nonzero(kept_clips(buffer, self.keep))[:, 0]
+        rows = torch.nonzero(buffer.valid)[:, 0]
         updates = tuple(self._update(buffer, rows) for _ in range(self.settings.updates_per_buffer))
         self.iterations += 1
         rewards = buffer.reward
@@ -89,16 +86,34 @@ class FlowMatchingLearner:
         return UpdateReport(-float(loss.detach()), NAN, NAN, NAN, NAN, norm, len(repeated))
 
 
-def kept_clips(buffer: RolloutBuffer, keep: Kept) -> Tensor:
-    """Return which clips train, bool (N,): the valid ones, or of each group the valid one of highest reward."""
-    if keep == "all":
-        return buffer.valid
-    rewards = torch.where(buffer.valid, buffer.reward, -torch.inf)
-    kept = torch.zeros_like(buffer.valid)
-    for group in set(buffer.group_ids.tolist()):
-        rows = torch.nonzero(buffer.group_ids == group)[:, 0]
-        kept[rows[rewards[rows].argmax()]] = True
-    return kept & buffer.valid
+def best_and_worst(rewards: Tensor, group_ids: Tensor) -> tuple[Tensor, Tensor]:
+    """Return of each group, ascending, the rows of highest and of lowest reward, int64 (G,) each; where all are equal
+    two others, too. rewards: (N,), NaN counts as lowest."""
+    best, worst = [], []
+    for group in sorted(set(group_ids.tolist())):
+        rows = torch.nonzero(group_ids == group)[:, 0]
+        order = rewards[rows].nan_to_num(nan=-math.inf).argsort(stable=True)
+        best.append(int(rows[order[-1]]))
+        worst.append(int(rows[order[0]]))
+    return torch.tensor(best), torch.tensor(worst)
+
+
+class BestAndRecorded(RecordedContexts):
+    """Of each group the clip of highest reward trains, and as much the context's recording, in the row of the lowest.
+
+    Without recordings flow matching on own clips diverges: made in a few steps, they vary less than recorded ones, and
+    each buffer less than the one before.
+    """
+
+    def score(self, request: GroupRequest, clips: RolloutBuffer) -> RolloutBuffer:
+        scored = super().score(request, clips)
+        best, worst = best_and_worst(scored.reward, scored.group_ids)
+        latents, total = scored.rollout.latents.clone(), torch.full_like(scored.reward, NAN)
+        recorded = self.folder.codec.encode(self.references(replace(request, group_size=1)).frames)
+        latents[worst] = recorded.to(latents)
+        total[best], total[worst] = scored.reward[best], scored.reward[best]
+        clips = replace(scored, rollout=replace(scored.rollout, latents=latents))
+        return clips.with_rewards({**scored.rewards, "total": total})
 
 
 class RecordedTargets(RecordedContexts):

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from wm_nodes.config.load import POLICY, VIDEO, Config, judge_overrides, preset_names
+from wm_nodes.config.tasks import task_names
 from wm_nodes.core.memory import keep_freed_memory
 from wm_nodes.launching.scenarios import PAGE
 from wm_nodes.reports.live_page import HOST, free_port
@@ -29,9 +30,11 @@ OPTION_OF = {
 
 
 def add_preset(parser: argparse.ArgumentParser, default: str, loop: str = POLICY) -> None:
-    """--preset, --device and every setting of a loop."""
+    """--preset, --device and every setting of a loop; of loop 2 also --task."""
     names = ", ".join(preset_names(loop))
     parser.add_argument("--preset", default=default, help=f"one of {names}, or a .yaml (default: {default})")
+    if loop == VIDEO:
+        parser.add_argument("--task", choices=task_names(), help="whose recordings they are (default: the preset's)")
     add_settings(parser, loop)
     add_device(parser)
 
@@ -131,9 +134,13 @@ def judge_settings(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def settings(arguments: argparse.Namespace) -> dict[str, Any]:
-    """The dotted settings that were given, by their names or as --seed or --device."""
-    seed = getattr(arguments, "seed", None)
-    return {**arguments.settings, **device_settings(arguments), **({} if seed is None else {"seed": seed})}
+    """The dotted settings that were given, by their names or as --seed or --device, of loop 2 also --task."""
+    named = ("seed", "task") if arguments.settings_of == VIDEO else ("seed",)
+    given = {name: getattr(arguments, name, None) for name in named}
+    return {
+        **arguments.settings, **device_settings(arguments),
+        **{name: value for name, value in given.items() if value is not None},
+    }
 
 
 def device_settings(arguments: argparse.Namespace) -> dict[str, Any]:
