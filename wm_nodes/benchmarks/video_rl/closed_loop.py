@@ -159,6 +159,8 @@ class ClosedLoop(RecordedTrainings[ClosedLoopPlan]):
     """Held-out episodes."""
     eval_every: Count = ClosedLoopPlan.eval_every
     """Buffers between two evaluations."""
+    history: int = ClosedLoopPlan.history
+    """Clips at most that the model makes before those of a group."""
     models: Path | None = None
     """Keep the trained models here, a folder each."""
 
@@ -166,7 +168,8 @@ class ClosedLoop(RecordedTrainings[ClosedLoopPlan]):
 
     def trials(self) -> list[SamplerTrial[ClosedLoopPlan]]:
         plan = ClosedLoopPlan(
-            self.iterations, self.contexts, eval_contexts=self.eval_contexts, eval_every=self.eval_every
+            self.iterations, self.contexts, eval_contexts=self.eval_contexts, eval_every=self.eval_every,
+            history=self.history,
         )
         return [SamplerTrial(arm, plan) for arm in self.with_rate(closed_loop_samplers())]
 
