@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from wm_nodes.config.load import load_config
+from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import get_task, success, task_names
 from wm_nodes.core.tool_control import check_actions, next_state
+from wm_nodes.core.types import RECOVERY, TAKEN_OVER, Observation
 from wm_nodes.environments.maniskill import backend
 from wm_nodes.environments.maniskill.backend import NoRendererError, render_backend
 from wm_nodes.environments.maniskill.behaviours import sample_style
@@ -22,7 +24,9 @@ from wm_nodes.environments.maniskill.episodes import EXTREME, HOLD_STEPS, planne
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner
 from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
-from wm_nodes.environments.record import collect_plan, demonstration_plan
+from wm_nodes.environments.record import collect_plan, demonstration_plan, recovery_plan
+from wm_nodes.policy_rl.behaviour_cloning import demonstrations
+from wm_nodes.policy_rl.initial_policy import prepare_start
 from wm_nodes.recording import read_episodes
 
 CONFIG = load_config("smoke")
@@ -216,3 +220,33 @@ def test_collection_writes_bags_and_does_not_collect_again(tmp_path: Path) -> No
     other = dataclasses.replace(plan, num_episodes=2)
     assert collect_plan(other, config, tmp_path) == bags
     assert [path.stat().st_mtime_ns for path in sorted(bags[0].iterdir())] == written
+
+
+def standing_still(_observation: Observation, _seed: int) -> np.ndarray:  # type: ignore[type-arg]
+    return np.zeros(3, np.float32)
+
+
+def test_the_script_ends_what_a_policy_began_and_reaches_success(tmp_path: Path) -> None:
+    config = load_config("cpu", {"task": "push_cube", "sft.recoveries": 3, "simulation.max_episode_steps": 24})
+    plan = recovery_plan(config, lambda: standing_still, planned=5)
+    assert plan.first_seed == demonstration_plan(config, 5).first_seed + 5 and plan.num_episodes == 6
+    episodes = [episode for bag in collect_plan(plan, config, tmp_path) for episode in read_episodes(bag)]
+    begun = [episode.extra[TAKEN_OVER] for episode in episodes]
+    assert {episode.behaviour for episode in episodes} == {RECOVERY} and len(set(begun)) > 1
+    for episode, first in zip(episodes, begun, strict=True):
+        assert 1 <= first < 12 and not episode.actions[:first].any() and episode.actions[first].any()
+        assert not episode.success[: first + 1].any()
+    found = demonstrations(episodes, config.sft.recoveries, RECOVERY, "sft.recoveries")
+    assert [episode.success[-1] for episode in found] == [True] * 3
+
+
+@pytest.mark.slow
+def test_a_start_with_recoveries_is_cloned_twice(tmp_path: Path) -> None:
+    config = load_config("smoke", {"task": "push_cube", "sft.recoveries": 2, "data.num_workers": 1})
+    model = shipped_model("push_cube")
+    _, weak = prepare_start(config, tmp_path, model)
+    assert weak.with_name("clone.safetensors").read_bytes() != weak.read_bytes()
+    bags = sorted((tmp_path / "bags" / "recoveries").glob("shard_*"))
+    assert [episode.behaviour for bag in bags for episode in read_episodes(bag)] == [RECOVERY] * 4
+    with pytest.raises(ValueError, match=r"were made with sft\.recoveries 2, not 0"):
+        prepare_start(config.with_values(sft=config.sft.with_values(recoveries=0)), tmp_path, model)

@@ -10,7 +10,7 @@ from rl_toys import toy_policy
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import SftConfig
-from wm_nodes.core.types import Episode, UInt8Array
+from wm_nodes.core.types import RECOVERY, TAKEN_OVER, Episode, UInt8Array
 from wm_nodes.policy_rl.behaviour_cloning import demonstrations, train_sft
 from wm_nodes.policy_rl.validation.evaluation import evaluate
 
@@ -129,3 +129,19 @@ def test_other_data_are_refused() -> None:
         train_sft(toy_policy(), [replace(DEMOS[0], behaviour="noisy")], settings(), 0)
     with pytest.raises(ValueError, match="got 0"):
         train_sft(toy_policy(), [], settings(), 0)
+
+
+def test_of_a_recovery_only_what_the_expert_acted_is_learned_and_only_where_the_success_is_his() -> None:
+    taken_over = [replace(demo, behaviour=RECOVERY, extra={TAKEN_OVER: 1}) for demo in DEMOS[:3]]
+    early = np.zeros_like(DEMOS[0].success)
+    early[0] = True
+    won_before = replace(taken_over[0], success=early)
+    assert demonstrations([DEMOS[0], won_before, *taken_over[1:]], 2, RECOVERY, "sft.recoveries") == taken_over[1:]
+    with pytest.raises(ValueError, match=r"sft\.recoveries is 2, but the data hold 1 successful recovery episodes"):
+        demonstrations([won_before, taken_over[1]], 2, RECOVERY, "sft.recoveries")
+    wrong = replace(taken_over[0], actions=np.concatenate([-DEMOS[0].actions[:1], DEMOS[0].actions[1:]]))
+    steps = [int(demo.success.argmax()) for demo in DEMOS[:2]]
+    results = [train_sft(toy_policy(), [one, DEMOS[1]], settings(num_iterations=5), 0)
+               for one in (taken_over[0], wrong)]
+    assert [result.num_samples for result in results] == [steps[0] - 1 + steps[1]] * 2
+    np.testing.assert_array_equal(results[0].losses, results[1].losses)

@@ -268,6 +268,9 @@ class SftConfig(SettingsSection):
     """Recordings whose successful episodes are the demonstrations, whoever acted; empty: MPLib plans them."""
     scenes: ScenesName = ""
     """Where MPLib plans them, as simulation.scenes; empty: there."""
+    recoveries: NonNegativeInt = 0
+    """Further demonstrations, which the task's script acts from where a clone of the others has got to after some of
+    its steps; only the script's are learned."""
 
 
 class PpoConfig(SettingsSection):

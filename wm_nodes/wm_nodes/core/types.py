@@ -80,6 +80,11 @@ class Environment(Protocol):
     def close(self) -> None: ...
 
 
+RECOVERY, TAKEN_OVER = "recovery", "taken_over"
+"""Episode.behaviour of an episode that a policy began and an expert ended; Episode.extra[TAKEN_OVER] is his first step.
+"""
+
+
 @dataclass(frozen=True)
 class Episode:
     """One recorded episode of one environment, T steps."""

@@ -3,7 +3,8 @@
 import csv
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,9 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT, STARTS, SeedRange, demonstration_seeds
 from wm_nodes.config.tasks import get_task, model_tasks, recorded_task
 from wm_nodes.core.files import write_atomic
-from wm_nodes.core.types import Episode
+from wm_nodes.core.types import RECOVERY, Episode
 from wm_nodes.environments import collection
-from wm_nodes.environments.collection import CollectionPlan, collect
+from wm_nodes.environments.collection import CollectionPlan, PolicyAct, collect
 from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.recording import Bag, EpisodeBagWriter
 
@@ -81,6 +82,14 @@ def demonstration_plan(config: RunConfig, num_episodes: int, first_seed: int | N
         task=config.task, simulation=simulation, num_episodes=num_episodes, first_seed=first_seed,
         behaviours={"expert": 1.0}, end_on_success=True,
     )
+
+
+def recovery_plan(config: RunConfig, make_policy: Callable[[], PolicyAct], planned: int) -> CollectionPlan:
+    """Return the plan of twice sft.recoveries episodes, each begun by a policy and ended by the script, where
+    demonstrations are planned; on the reset seeds that follow theirs, of which there are `planned`."""
+    count = 2 * config.sft.recoveries
+    plan = demonstration_plan(config, count, demonstration_seeds(config.seed, planned + count) + planned)
+    return replace(plan, behaviours={}, make_policy=make_policy, policy_label=RECOVERY, recovers=True)
 
 
 def first_frames_plan(config: RunConfig, num_episodes: int) -> CollectionPlan:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from wm_nodes.config.schema import SftConfig
 from wm_nodes.core.seeding import torch_stream
-from wm_nodes.core.types import Episode, UInt8Array
+from wm_nodes.core.types import RECOVERY, TAKEN_OVER, Episode, UInt8Array
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.recording.episode_arrays import check_finite
 
@@ -50,20 +50,32 @@ class _Frames:
         return policy.cloning_error(self.features_BF[rows], self.states_BS[rows], self.actions_BA[rows])
 
 
-def demonstrations(episodes: Iterable[Episode], count: int) -> list[Episode]:
-    """Return the first `count` expert episodes that reach success.
+def demonstrations(
+    episodes: Iterable[Episode], count: int, behaviour: str = EXPERT, setting: str = "sft.num_demonstrations"
+) -> list[Episode]:
+    """Return the first `count` episodes of a behaviour that reach success after their expert has begun to act. setting:
+    what asks for so many.
 
     Raises:
         ValueError: there are fewer.
     """
-    successful = (episode for episode in episodes if episode.behaviour == EXPERT and bool(episode.success.any()))
+    successful = (
+        episode for episode in episodes
+        if episode.behaviour == behaviour and bool(episode.success.any())
+        and not episode.success[: expert_from(episode)].any()
+    )
     demos = list(islice(successful, count))
     if len(demos) < count:
         raise ValueError(
-            f"sft.num_demonstrations is {count}, but the data hold {len(demos)} successful {EXPERT} episodes; collect "
-            "more or ask for fewer"
+            f"{setting} is {count}, but the data hold {len(demos)} successful {behaviour} episodes; collect more or "
+            "ask for fewer"
         )
     return demos
+
+
+def expert_from(episode: Episode) -> int:
+    """The first step that its expert acted."""
+    return int(episode.extra.get(TAKEN_OVER, 0))
 
 
 def train_sft(
@@ -73,7 +85,8 @@ def train_sft(
     """Fit the actor's mean to the demonstrated actions in place; critic and log standard deviation stay. With
     config.heldout the last demonstrations are not learned, and the weights with the least error on them are kept.
 
-    Steps after the first success are left out: an episode ends there when a policy acts. The demonstrations also set
+    Steps after the first success are left out: an episode ends there when a policy acts; and those of a recovery before
+    its expert has taken over. The demonstrations also set
     the policy's feature normalisation. Every image counts once, and with `reconstruct` (the tokenizer's decode of
     encode, uint8 (B, H, W, 3)) once more as the world model will show it. `seed` draws the batches (stream `sft`).
     With one seed and one number of torch threads the result is bit-identical on a CPU.
@@ -82,7 +95,7 @@ def train_sft(
         ValueError: no demonstrations, none left to learn or to hold out, one that is not the expert's, or as
             check_finite.
     """
-    others = {episode.behaviour for episode in demos} - {EXPERT}
+    others = {episode.behaviour for episode in demos} - {EXPERT, RECOVERY}
     if not demos or others:
         raise ValueError(f"behaviour cloning needs {EXPERT} demonstrations, got {len(demos)} with {sorted(others)}")
     check_finite(demos)
@@ -124,9 +137,9 @@ def _frames(
     policy: ImagePolicy, demos: Sequence[Episode], reconstruct: Callable[[UInt8Array], UInt8Array] | None
 ) -> _Frames:
     """Arguments: as of train_sft."""
-    steps = [int(demo.success.argmax()) if demo.success.any() else demo.num_steps for demo in demos]
+    ends = [int(demo.success.argmax()) if demo.success.any() else demo.num_steps for demo in demos]
     images, states, actions = (
-        np.concatenate([getattr(demo, name)[:count] for demo, count in zip(demos, steps, strict=True)])
+        np.concatenate([getattr(demo, name)[expert_from(demo) : end] for demo, end in zip(demos, ends, strict=True)])
         for name in ("images", "states", "actions")
     )
     states_BS, actions_BA = (torch.from_numpy(a.astype(np.float32)).to(policy.device) for a in (states, actions))

@@ -4,6 +4,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -16,11 +17,17 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task, has_rule, has_simulator, success
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.core.types import Episode
+from wm_nodes.core.types import RECOVERY, Episode
 from wm_nodes.environments.collection import CollectionPlan
-from wm_nodes.environments.record import collect_plan, demonstration_plan, first_frames_plan, scripted_plan
+from wm_nodes.environments.record import (
+    collect_plan,
+    demonstration_plan,
+    first_frames_plan,
+    recovery_plan,
+    scripted_plan,
+)
 from wm_nodes.policy_rl.behaviour_cloning import EXPERT, demonstrations, train_sft
-from wm_nodes.policy_rl.factories import STARTS, make_policy, make_reconstruct, run_spec
+from wm_nodes.policy_rl.factories import STARTS, make_policy, make_reconstruct, policy_actor, run_spec
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.recording import BagReport, read_episodes
 from wm_nodes.training.weights import save_weights
@@ -103,11 +110,14 @@ def frames_before_success(episode: Episode, tasks: Sequence[str] = ()) -> int:
 
 
 def train_weak_policy(
-    config: RunConfig, model_dir: Path, demo_bags: Iterable[Path], path: Path, *, anyone: bool = False
+    config: RunConfig, model_dir: Path, demo_bags: Iterable[Path], path: Path, *, anyone: bool = False,
+    recoveries: Iterable[Path] = (),
 ) -> ImagePolicy:
     """Behaviour-clone a few demonstrations on raw and on tokenizer-reconstructed frames; write the weights to `path`.
 
-    anyone: whoever acted in a successful episode has demonstrated, not the planner alone.
+    Args:
+        anyone: whoever acted in a successful episode has demonstrated, not the planner alone.
+        recoveries: bags of sft.recoveries further demonstrations, see recovery_plan.
 
     Raises:
         ValueError: the bags hold fewer successful demonstrations than sft.num_demonstrations. BagError: they are of
@@ -119,6 +129,9 @@ def train_weak_policy(
     if anyone:
         episodes = (replace(episode, behaviour=EXPERT) for episode in episodes)
     demos = demonstrations(episodes, config.sft.num_demonstrations)
+    if more := [*recoveries]:
+        recovered = (e for bag in more for e in read_episodes(bag, expected=spec))
+        demos += demonstrations(recovered, config.sft.recoveries, RECOVERY, "sft.recoveries")
     train_sft(policy, demos, config.sft, config.seed, reconstruct=make_reconstruct(model_dir, config.device))
     save_weights(policy, path, {"tokenizer_sha256": policy.encoder.sha256})
     return policy
@@ -151,6 +164,11 @@ def _keep_settings(config: RunConfig, run_dir: Path, model_dir: Path) -> None:
     write_atomic(path, json.dumps(now, indent=1).encode())
 
 
+def planned_demonstrations(config: RunConfig) -> int:
+    """How many are planned, so that sft.num_demonstrations succeed."""
+    return config.sft.num_demonstrations + max(3, config.sft.num_demonstrations // 3)
+
+
 def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Path, Path]:
     """Collect demonstrations and starts and train the weak policy, as far as missing; return start_files(). Where
     sft.bags names the demonstrations, or no task can be simulated, those and the model's starts are taken.
@@ -160,9 +178,10 @@ def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Pa
     """
     _keep_settings(config, run_dir, model_dir)
     demos = [Path(bag) for bag in config.sft.bags]
+    if config.sft.recoveries and not has_simulator(config.task):
+        raise ValueError(f"sft.recoveries {config.sft.recoveries} need a script, and nothing simulates the task; set 0")
     if not demos:
-        spare = max(3, config.sft.num_demonstrations // 3)
-        plan = demonstration_plan(config, config.sft.num_demonstrations + spare)
+        plan = demonstration_plan(config, planned_demonstrations(config))
         demos = collect_plan(plan, config, run_dir / "bags" / "demos")
     starts, weak = start_files(run_dir)
     if not starts.exists() and not has_simulator(config.task):
@@ -171,5 +190,13 @@ def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Pa
         bags = collect_plan(starts_plan(config), config, run_dir / "bags" / "starts")
         write_starts(bags, starts, frames=config.data.start_frames, seed=config.seed)
     if not weak.exists():
-        train_weak_policy(config, model_dir, demos, weak, anyone=bool(config.sft.bags))
+        anyone, recoveries = bool(config.sft.bags), list[Path]()
+        if config.sft.recoveries:
+            clone = weak.with_name("clone.safetensors")
+            train_weak_policy(config, model_dir, demos, clone, anyone=anyone)
+            plan = recovery_plan(
+                config, partial(policy_actor, config, model_dir, clone), planned_demonstrations(config)
+            )
+            recoveries = collect_plan(plan, config, run_dir / "bags" / "recoveries")
+        train_weak_policy(config, model_dir, demos, weak, anyone=anyone, recoveries=recoveries)
     return starts, weak
