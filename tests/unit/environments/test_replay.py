@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from wm_nodes.config.load import load_config
+from wm_nodes.config.tasks import truth_columns
 from wm_nodes.core.types import Episode
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.episodes import scripted_episode
@@ -64,3 +65,14 @@ def test_arrays_that_do_not_belong_together_and_paths_that_are_not_finite_are_re
     path[0, 1, 2] = np.nan
     with pytest.raises(ValueError, match="path 0 is not finite"):
         execute_paths("push_cube", SIMULATION, [1], path, np.zeros((1, 2), np.float32), STRIDE)
+
+
+def test_an_arm_that_is_commanded_by_poses_follows_the_path_with_its_gripper_as_it_was() -> None:
+    simulation = load_config("cpu", {"task": "push", "simulation.scenes": "train"}).simulation
+    environment = ManiSkillEnvironment("push", simulation, end_on_success=False, pictures=False)
+    episode = scripted_episode(environment, "expert", 11, 11)
+    environment.close()
+    tool = truth_columns("push", "tool")
+    path, thing = episode.ground_truth[None, ::STRIDE, tool], truth_columns("push", "object")
+    executed = execute_paths("push", simulation, [11], path, episode.ground_truth[-1:, thing], STRIDE)
+    assert executed.tool_error_cm[0] < 1 and executed.success.tolist() == [bool(episode.success[-1])] == [True]

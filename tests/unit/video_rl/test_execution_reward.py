@@ -17,11 +17,18 @@ from wm_nodes.core.specs import EnvironmentSpec, SpecMismatch, spec_of_values
 from wm_nodes.environments.record import collect_plan, scripted_plan
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
-from wm_nodes.video_rl.execution_reward import EXECUTION_SCORES, ExecutionReward, make_execution_reward
+from wm_nodes.video_rl.execution_reward import (
+    EXECUTION_SCORES,
+    ExecutionReward,
+    check_execution,
+    check_followable,
+    make_execution_reward,
+)
 from wm_nodes.video_rl.reference_reward import load_probe
 from wm_nodes.video_rl.sampling import RecordedContexts
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.folder import read_world_manifest
+from wm_nodes.world_model.positions import columns_of
 
 WORLD = shipped_model("push_cube")
 SPEC = spec_of_values(read_world_manifest(WORLD)["spec"])
@@ -35,6 +42,16 @@ class FirstPixels:
     def read(self, frames: torch.Tensor) -> np.ndarray[Any, np.dtype[np.float32]]:
         values = frames[..., 0, :7, 0].float().numpy() * 0.004 - 0.5
         return np.asarray(values, np.float32)
+
+
+class ObjectsPixels(FirstPixels):
+    """The same for the positions of the tasks with poses, the tool of which comes after the object's."""
+
+    def read(self, frames: torch.Tensor) -> np.ndarray[Any, np.dtype[np.float32]]:
+        values, tool = super().read(frames), columns_of("push", "tool")
+        placed = np.zeros((*values.shape[:-1], max(tool) + 1), np.float32)
+        placed[..., tool] = values[..., 2:5]
+        return placed
 
 
 class Plain:
@@ -174,13 +191,47 @@ def test_recordings_of_another_environment_than_the_action_models_are_refused(
         load(replace(walks(), spec=spec(**other)))
 
 
-def test_a_model_of_other_tasks_and_one_that_is_commanded_by_poses_are_refused() -> None:
-    objects = shipped_model("pick_place")
-    with pytest.raises(ValueError, match=r"knows the tasks move_to_aim, .*, not 'push_cube'"):
-        load(walks(), **{"execution.model": str(objects)})
-    probe: Any = FirstPixels()
-    with pytest.raises(ValueError, match=r"is commanded by tool_dx, .*, gripper .*weigh another reward"):
-        ExecutionReward(load_model_folder(objects), folder_of(), walks(), probe)
+def test_a_model_of_other_tasks_and_an_arm_that_a_place_does_not_command_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"knows the tasks move_to_aim, .*, not 'push_cube'; name another"):
+        load(walks(), **{"execution.model": str(shipped_model("pick_place"))})
+    joints = spec(action_names=("a", "b"), action_scale=(1.0, 1.0), action_units=("rad", "rad"))
+    with pytest.raises(ValueError, match=r"is commanded by a, b from .*weigh another reward"):
+        check_followable(joints, walks())
+
+
+def pose_walks(gripper: float) -> Clips:
+    """The same of an arm that is commanded by poses, whose gripper ends at this value."""
+    clips, objects = walks(), read_world_manifest(shipped_model("push"))
+    states = np.zeros((*clips.states.shape[:2], 7), np.float32)
+    states[..., :3], states[..., 5], states[..., 6] = clips.states, 0.3, -1.0
+    states[:, -1, 6] = gripper
+    truth = np.zeros((*clips.ground_truth.shape[:2], len(objects["spec"]["ground_truth_names"])), np.float32)
+    tool = objects["spec"]["ground_truth_names"].index("tool_x")
+    truth[..., tool : tool + 3] = clips.ground_truth[..., TOOL]
+    return replace(
+        clips, states=states, ground_truth=truth, task="push", spec=spec_of_values(objects["spec"]),
+        actions=torch.zeros(len(states), 8, 14),
+    )
+
+
+def test_an_arm_that_is_commanded_by_poses_keeps_its_rotation_and_its_gripper() -> None:
+    clips, models = pose_walks(gripper=-1.0), load_model_folder(shipped_model("push"))
+    probe: Any = ObjectsPixels()
+    reward = ExecutionReward(models, folder_of(), clips, probe)
+    paths = reward.paths(clips.frames, clips)
+    np.testing.assert_allclose(paths, clips.states[..., :3], atol=3e-3)
+    steps = list(reward.follow(paths, clips))
+    assert len(steps) == 2 * (paths.shape[1] - 1)
+    for step in steps:
+        assert not step.actions_NA[:, 3:6].any() and (step.actions_NA[:, 6] == -1).all()
+    reached = steps[-1].arm.states_NP.numpy()
+    np.testing.assert_allclose(reached[:, :3], paths[:, -1], atol=1e-3)
+    np.testing.assert_allclose(reached[:, 3:], clips.states[:, 0, 3:], atol=1e-5)
+
+
+def test_a_task_whose_gripper_opens_or_closes_is_refused_before_anything_is_made() -> None:
+    with pytest.raises(ValueError, match=r"in 12 of 12 recordings of push the gripper opens or closes"):
+        check_execution(load_video_config("outcome", {"task": "push"}), pose_walks(gripper=1.0))
 
 
 def test_clips_that_do_not_begin_with_a_recorded_frame_and_its_state_are_refused() -> None:

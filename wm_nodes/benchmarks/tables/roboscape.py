@@ -30,7 +30,8 @@ from wm_nodes.config.schema import PolicyInputs
 from wm_nodes.config.tasks import parts_of
 from wm_nodes.core.statistics import t_interval
 
-REWARDS, TRAINED = "roboscape_rewards.json", ("roboscape_table1.json", "roboscape_more.json")
+REWARDS, RECOVERIES = "roboscape_rewards.json", "roboscape_recoveries.json"
+TRAINED = "roboscape_table1.json", "roboscape_more.json", "roboscape_tasks.json"
 PPO, CLONES, EXTREME, SEVERAL, UNAIDED = (
     f"roboscape_{name}.json" for name in ("ppo", "clones", "extreme_actions", "table2", "no_positions")
 )
@@ -129,6 +130,21 @@ def clones() -> Rows:
                 task, seen, count,
                 *(percent(its[early][split]["rate"]) if early in its else "" for early in (False, True)
                   for split in splits()),
+            )
+
+
+def recoveries() -> Rows:
+    """Beside the clones of Table 1 those of as many demonstrations more, or recoveries."""
+    found = [*(row for task in (*TASKS, OURS) for row in trained(SFT, task)), *read(RECOVERIES)["rows"]]
+    learned = [(row["config"]["sft"]["num_demonstrations"], row["config"]["sft"].get("recoveries", 0)) for row in found]
+    for task in (*TASKS, OURS):
+        numbers = {its for row, its in zip(found, learned, strict=True) if row["task"] == task}
+        for demonstrations, more in sorted(numbers, key=lambda one: (sum(one), one)):
+            of = [row for row, its in zip(found, learned, strict=True)
+                  if row["task"] == task and its == (demonstrations, more)]
+            yield (
+                task, demonstrations, more or "", ", ".join(str(row["seed"]) for row in of),
+                *(by_seed([success_of(row, domain) for row in of]) for domain in DOMAINS),
             )
 
 

@@ -6,11 +6,13 @@ from statistics import mean, variance
 from benchmarks.tables.table import Rows, Run, interval, lines, percent, points, read, runs
 from benchmarks.tables.video_rl import gained, over_seeds, samplers
 from benchmarks.video_rl.comparison import compare_samplers
+from wm_nodes.core.statistics import t_975
 
 OUTCOME, EARLY, JUDGED = (f"video_rl_outcome{of}.json" for of in ("", "_early", "_judge"))
 EXECUTED, MIXED = "video_rl_outcome_execution.json", "video_rl_outcome_mixed.json"
 AFTER = "measured_after"
-CLOSED_LOOP, ENVIRONMENTS = "video_rl_closed_loop.jsonl", "environments.jsonl"
+CLOSED_LOOP, LONGER, TRAINED_IN = (f"video_rl_closed_loop{of}" for of in (".jsonl", "_history.json", "_policies.json"))
+BEFORE, AFTER_CPS, AFTER_RECORDINGS = (f"video model {of}" for of in ("before", "after CPS", "after recordings"))
 PROBE_PAID, JUDGE_PAID = "CPS 0.4", "CPS 0.4, judge robot"
 CHANGES = (("error_cm", 2), ("object_cm", 2), ("tool_cm", 2), ("psnr_db", 2))
 UNPAID = (
@@ -18,7 +20,6 @@ UNPAID = (
     ("impossible_tool_steps", 3),
 )
 ACCEPTED = ("accepted", "accepted_executed")
-T_10 = 2.228  # 97.5 % quantile of Student's t for 10 degrees of freedom
 
 
 def outcome() -> Rows:
@@ -52,9 +53,7 @@ def executed() -> Rows:
                     for name in (JUDGE_PAID, PROBE_PAID))
     change, (a, b) = mean(judge) - mean(probe), (variance(some) / len(some) for some in (judge, probe))
     freedom = (a + b) ** 2 / (a**2 / (len(judge) - 1) + b**2 / (len(probe) - 1))
-    if int(freedom) != 10:
-        raise ValueError(f"Student's t is known for 10 degrees of freedom, got {freedom:.1f}; add its quantile")
-    half, cells = T_10 * math.sqrt(a + b), []
+    half, cells = t_975(int(freedom)) * math.sqrt(a + b), []
     for when in ("before", "after"):
         accepted, real = (mean(one[f"measured_{when}"][key] for one in judged) for key in ACCEPTED)
         cells += [percent(accepted), percent(real / accepted)]
@@ -110,24 +109,45 @@ def by_clip() -> Rows:
         yield clip, *gained(trained, [(f"{name}_cm_{clip}", 2) for name in ("object", "tool")])
 
 
+def longer_histories() -> Rows:
+    rows = read(LONGER)["rows"]
+    for history in sorted({one["plan"]["history"] for one in rows}):
+        of = [one for one in rows if one["plan"]["history"] == history]
+        changes = [(f"{name}_cm_{clip}", 2) for clip in (3, 4) for name in ("object", "tool")]
+        yield history, len(of), *gained(of, changes)
+
+
 def trained_in() -> Rows:
-    found = runs(ENVIRONMENTS)
-    rows, correlations = found["trained in"]["rows"], found["ranking"]["correlations"]
+    rows = read(TRAINED_IN)["rows"]
     for model in dict.fromkeys(one["model"] for one in rows):
         of = [one for one in rows if one["model"] == model]
         real, imagined = (mean(one[name]["rate"] for one in of) for name in ("real_after", "imagined_after"))
+        accepted = sum(one["accepted"] for one in of)
         yield (
             model, ", ".join(percent(one["real_after"]["rate"]) for one in of), percent(real), percent(imagined),
-            f"{100 * (imagined - real):+.1f}",
+            f"{100 * (imagined - real):+.1f}", f"{accepted} of {len(of)}",
+        )
+
+
+def ranking() -> Rows:
+    found = runs("environments.jsonl")
+    rows, correlations = found["trained in"]["rows"], found["ranking"]["correlations"]
+    for model in dict.fromkeys(one["model"] for one in rows):
+        real = [one["real_after"]["rate"] for one in rows if one["model"] == model]
+        yield (
+            model, ", ".join(map(percent, real)), percent(mean(real)),
             "{correlation:+.2f} [{low:+.2f}, {high:+.2f}]".format(**correlations[model]),
         )
 
 
 def models_compared() -> Rows:
-    rows = runs(ENVIRONMENTS)["trained in"]["rows"]
+    rows = read(TRAINED_IN)["rows"]
     after = {(one["model"], one["seed"]): one["success_after"] for one in rows}
     seeds = sorted({one["seed"] for one in rows})
-    for better, base in (("video model after", "video model before"), ("world model", "video model after")):
+    for better, base in (
+        (AFTER_CPS, BEFORE), (AFTER_CPS, AFTER_RECORDINGS), (AFTER_RECORDINGS, BEFORE),
+        (f"{BEFORE}, threshold 0.9", BEFORE), ("world model", AFTER_CPS),
+    ):
         won, base_won = ([x for seed in seeds for x in after[model, seed]] for model in (better, base))
         rates = [100 * (mean(after[better, seed]) - mean(after[base, seed])) for seed in seeds]
         yield f"{better} - {base}", len(won), points(base_won, won), over_seeds(rates, 1)

@@ -25,7 +25,7 @@ from wm_nodes.config.load import (
     reward_overrides,
     with_judge,
 )
-from wm_nodes.config.schema import AGENT, RunConfig
+from wm_nodes.config.schema import AGENT, EXECUTION, RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT, MODEL_EPISODES
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
@@ -40,6 +40,7 @@ from wm_nodes.launching.runner import Runner
 from wm_nodes.reports.stages import Stages
 from wm_nodes.training.run_record import Starter
 from wm_nodes.video_model.clips import load_clips
+from wm_nodes.video_rl.execution_reward import check_execution
 from wm_nodes.video_rl.pretraining import make_video_model, shipped_video_model
 from wm_nodes.video_rl.recorded_buffers import recorded_bags
 from wm_nodes.video_rl.reference_reward import load_probe
@@ -113,6 +114,8 @@ def _run(arguments: argparse.Namespace, config: VideoRlConfig, run_dir: Path) ->
     heldout = load_clips(heldout_bags, config.model.stride, config.clip_steps)
     stage("video model: " + ("the shipped one" if shipped else "flow matching"))
     clips = load_clips(bags, config.model.stride, config.clip_steps)
+    if config.rewards.get(EXECUTION):
+        check_execution(config, clips)
     if config.rewards.get(AGENT):
         judge, fps = for_task(config.judge, config.task), clip_fps(bags[0], config.model.stride)
         check_clips(judge, tuple(clips.frames.shape[1:]), fps)

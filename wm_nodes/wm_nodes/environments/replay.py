@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.config.tasks import success, truth_columns
+from wm_nodes.core.tool_control import hold_actions
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 
@@ -35,8 +36,9 @@ def execute_paths(
     """Follow each tool path (N, F, 3) from the scene of its reset seed, `stride` control steps from frame to frame.
 
     Each step commands action = clip((target - tool) / max_action_m, -1, 1), target on the straight line between two
-    frames. `tool` is the measured tool, not the commanded one, which the arm lags behind: so the tool gets to where the
-    clip shows it. A step that is too long for the arm is not made up for; that is a part of the answer.
+    frames; where actions are poses, rotation and gripper stay as they are. `tool` is the measured tool, not the
+    commanded one, which the arm lags behind: so the tool gets to where the clip shows it. A step that is too long for
+    the arm is not made up for; that is a part of the answer.
 
     Args:
         simulation: of the recordings that the clips begin with.
@@ -65,12 +67,12 @@ def _follow(
     truths = np.empty((*paths.shape[:2], env.spec.ground_truth_dim), np.float32)
     for clip, path in enumerate(paths):
         env.reset(seeds=np.array([seeds[clip]], np.uint64))
-        truths[clip, 0] = env.ground_truth[0]
+        truths[clip, 0], actions = env.ground_truth[0], hold_actions(env.current().state, env.spec)
         for step in range(steps):
             frame, share = step // stride, (step % stride + 1) / stride
             target = path[frame] + share * (path[frame + 1] - path[frame])
-            action = (target - env.ground_truth[0, tool]) / simulation.max_action_m
-            truths[clip, frame + 1] = env.step(np.clip(action, -1, 1)[None].astype(np.float32)).ground_truth[0]
+            actions[:, :3] = np.clip((target - env.ground_truth[0, tool]) / env.spec.action_scale[0], -1, 1)
+            truths[clip, frame + 1] = env.step(actions).ground_truth[0]
     env.close()
     return truths
 

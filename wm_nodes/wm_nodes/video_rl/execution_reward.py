@@ -1,7 +1,8 @@
 """The reward `execution` (DD-34): whether the task gets done when the action world model follows a clip's tool path.
 
 Shapes: N clips, E recordings, F frames, H W 3 image, P positions. Places of the tool are those of commanded states, m.
-No simulator is asked, and nothing is known of how the recording of a clip's context ended.
+No simulator is asked, and nothing is known of how the recording of a clip's context ended. An arm that is commanded by
+poses keeps rotation and gripper of its first state: a clip's tool path says nothing of them.
 """
 
 from collections.abc import Iterator
@@ -18,12 +19,13 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import EXECUTION
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
-from wm_nodes.core.specs import MODEL_FIELDS, EnvironmentSpec, agree, tool_spec
-from wm_nodes.core.tool_control import moves_pose
+from wm_nodes.core.specs import MODEL_FIELDS, EnvironmentSpec, agree, spec_of_values, tool_spec
+from wm_nodes.core.tool_control import hold_actions, moves_pose
 from wm_nodes.core.types import FloatArray
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.world_model import DeviceEnvironment, WorldModels, load_model_folder
+from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.imagined_episodes import imagined_spec
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.positions import columns_of, probe_targets
@@ -36,6 +38,10 @@ START_ERROR_M = 5e-3
 """Most by which a recording's first commanded state may differ from where its tool is."""
 ROWS = 256
 """Clips that are followed at a time."""
+PLACE = slice(0, 3)
+"""The tool's place in a commanded state, and its translation in an action."""
+GRIPPER, MOST_GRASPING = 6, 0.2
+"""The gripper in a commanded state of a pose; the largest share of recordings in which it may move."""
 DECIMALS = 6
 """Of the correction: libraries differ in the last bits of a least-squares solution."""
 
@@ -47,14 +53,28 @@ def make_execution_reward(
     the task, on the folder's device.
 
     Raises:
-        ValueError: the model does not fit the recordings; as ExecutionReward.
+        ValueError: as check_execution; as ExecutionReward.
+    """
+    models = load_model_folder(check_execution(config, recordings), folder.device)
+    return ExecutionReward(models, folder, recordings, probe)
+
+
+def check_execution(config: VideoRlConfig, recordings: Clips) -> Path:
+    """Return the folder of the action world model that follows clips. It reads only the model's manifest.
+
+    Raises:
+        ValueError: the model does not fit the recordings; as check_followable.
     """
     model_dir = Path(config.execution.model) if config.execution.model else shipped_model(config.task)
-    models = load_model_folder(model_dir, folder.device)
-    models.task_index(recordings.task)
+    manifest = read_world_manifest(model_dir)
+    if recordings.task not in manifest["tasks"]:
+        raise ValueError(f"{model_dir} knows the tasks {', '.join(manifest['tasks'])}, not {recordings.task!r}; name "
+                         "another execution.model")
+    spec = spec_of_values(manifest["spec"])
     remedy = "name another execution.model, or draw contexts from recordings that this one was trained with"
-    agree(tool_spec(recordings.spec), models.spec, f"{model_dir} was trained with", MODEL_FIELDS, simulated=remedy)
-    return ExecutionReward(models, folder, recordings, probe)
+    agree(tool_spec(recordings.spec), spec, f"{model_dir} was trained with", MODEL_FIELDS, simulated=remedy)
+    check_followable(spec, recordings)
+    return model_dir
 
 
 class FollowedStep(NamedTuple):
@@ -91,7 +111,7 @@ class ExecutionReward:
             raise ValueError("the reward execution follows clips from a recorded frame; set model.num_conditioning 1")
         self._models, self._probe, self._stride = models, probe, folder.clip["stride"]
         self._task, self._tool = recordings.task, columns_of(recordings.task, "tool")
-        check_followable(models.spec, len(self._tool))
+        check_followable(models.spec, recordings)
         places = _commanded_places(recordings, self._tool)
         seen = probe.read(folder.codec.decode(folder.codec.encode(recordings.frames)))[..., self._tool]
         self.correction = fit_tool_correction(seen, places).round(DECIMALS)
@@ -118,7 +138,7 @@ class ExecutionReward:
         place that each frame shows, as far as reach_m."""
         seen = self._probe.read(frames)[..., self._tool]
         places = seen @ self.correction[:3] + self.correction[3]
-        places[:, 0] = references.first_states()
+        places[:, 0] = references.first_states()[:, PLACE]
         for now in range(1, places.shape[1]):
             step = places[:, now] - places[:, now - 1]
             length = np.linalg.norm(step, axis=-1, keepdims=True)
@@ -141,11 +161,13 @@ class ExecutionReward:
         arm = DeviceEnvironment(self._models, spec, starts, endless, num_envs=count, with_goals=False)
         arm.reset(torch.ones(count, dtype=torch.bool, device=arm.device), torch.arange(count, device=arm.device))
         path = torch.from_numpy(paths).to(arm.device)
-        scale = torch.tensor(spec.action_scale, device=arm.device)
+        scale = torch.tensor(spec.action_scale[PLACE], device=arm.device)
+        kept = torch.from_numpy(hold_actions(references.first_states(), spec)).to(arm.device)
         for step in range(spec.max_episode_steps):
             frame, share = step // self._stride, (step % self._stride + 1) / self._stride
             target = path[:, frame] + share * (path[:, frame + 1] - path[:, frame])
-            actions = ((target - arm.states_NP) / scale).clamp(-1, 1)
+            moves = ((target - arm.states_NP[:, PLACE]) / scale).clamp(-1, 1)
+            actions = torch.cat([moves, kept[:, PLACE.stop :]], 1)
             yield FollowedStep(actions, arm.step(actions).signal_N, arm)
         arm.check_finite()
 
@@ -155,20 +177,28 @@ class ExecutionReward:
         return torch.stack([step.signal_N for step in self.follow(paths, references)]).amax(0).double().cpu()
 
 
-def check_followable(spec: EnvironmentSpec, tool_dim: int) -> None:
-    """Raise ValueError unless a tool path says all that an environment is commanded by."""
-    if moves_pose(spec) or spec.measured or not spec.action_dim == spec.tool_dim == tool_dim == 3:
+def check_followable(spec: EnvironmentSpec, recordings: Clips) -> None:
+    """Raise ValueError unless a tool path says what an environment is commanded by to do what was recorded."""
+    pose = moves_pose(spec)
+    if spec.measured or len(columns_of(recordings.task, "tool")) != 3 or not (pose or spec.action_dim == 3):
         raise ValueError(
             f"the reward execution follows a tool's place in three coordinates, and {spec.env_id} is commanded by "
             f"{', '.join(spec.action_names)} from {', '.join(spec.state_names[: spec.tool_dim])}; weigh another reward"
         )
+    if pose:
+        moved = np.ptp(recordings.states[..., GRIPPER], axis=1) > 0
+        if moved.mean() > MOST_GRASPING:
+            raise ValueError(
+                f"the reward execution follows a tool's place, and in {moved.sum()} of {len(moved)} recordings of "
+                f"{recordings.task} the gripper opens or closes, which no place says; weigh another reward"
+            )
 
 
 def _commanded_places(recordings: Clips, tool: list[int]) -> FloatArray:
     """Return where the tool is in recordings, (E, F, 3), in the frame of commanded states: at a reset it is where the
     first one says. NaN where no simulator state is known."""
     truth = probe_targets(recordings.ground_truth, recordings.task)[..., tool]
-    apart = recordings.first_states() - truth[:, 0]
+    apart = recordings.first_states()[:, PLACE] - truth[:, 0]
     known = np.isfinite(apart).all(1)
     if not known.any():
         raise ValueError("the reward execution needs recordings with simulator state, by which the reading of the tool "
