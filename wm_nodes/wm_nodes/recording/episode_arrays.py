@@ -124,12 +124,14 @@ def stack_episodes(
     frame_rows = [np.minimum(np.arange(steps + 1), e.num_steps) for e in listed]
     lengths = np.array([min(e.num_steps, steps) for e in listed], np.int64)
     actions = np.zeros((len(listed), steps, listed[0].actions.shape[1]), np.float32)
+    images = np.empty((len(listed), steps + 1, *listed[0].images.shape[1:]), listed[0].images.dtype)
     for row, episode in enumerate(listed):
         actions[row, : lengths[row]] = episode.actions[: lengths[row]]
+        images[row] = episode.images[frame_rows[row]]  # one by one: they are most of the memory
     truth = np.stack([e.ground_truth[rows] for e, rows in zip(listed, frame_rows, strict=True)])
     said = np.stack([e.success[rows] for e, rows in zip(listed, frame_rows, strict=True)])
     return EpisodeArrays(
-        images=np.stack([e.images[rows] for e, rows in zip(listed, frame_rows, strict=True)]),
+        images=images,
         states=np.stack([s[rows] for s, rows in zip(tool_states, frame_rows, strict=True)]), actions=actions,
         ground_truth=truth,
         success=np.stack([np.asarray(success_or_recorded(task, truth, said), bool) for task in tasks], -1),
