@@ -16,9 +16,9 @@ from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.recording import EpisodeBagWriter, read_episodes
-from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
+from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
-from wm_nodes.video_model.clips import Clips, cut_clips, load_clips
+from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.conditions import hashed_words
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
@@ -66,26 +66,6 @@ def test_equal_words_have_equal_vectors_and_case_does_not_matter() -> None:
     rows = hashed_words(["push the cube", "Push"], 5)
     assert rows.shape == (2, 3, 5)
     assert torch.equal(rows[0, 0], rows[1, 0]) and not rows[1, 1:].any()
-
-
-def episodes(steps: int = 4) -> EpisodeArrays:
-    images = np.arange(2 * (steps + 1), dtype=np.uint8).reshape(2, steps + 1, 1, 1, 1) * np.ones((8, 8, 3), np.uint8)
-    actions = np.arange(2 * steps * 3, dtype=np.float32).reshape(2, steps, 3)
-    truth = np.zeros((2, steps + 1, len(GROUND_TRUTH_NAMES)), np.float32)
-    success = np.zeros((2, steps + 1, 1), bool)
-    states = np.zeros((2, steps + 1, 3), np.float32)
-    lengths = np.full(2, steps, np.int64)
-    return EpisodeArrays(
-        images, states, actions, truth, success, lengths, ("t",), ("push", "push"), ("a", "b"), ("t", "t")
-    )
-
-
-def test_a_clip_takes_every_second_frame_with_the_actions_between_in_order() -> None:
-    clips = cut_clips(episodes(), 2, make_spec())
-    assert clips.frames[1, :, 0, 0, 0].tolist() == [5, 7, 9]
-    assert clips.actions[0].tolist() == [[0, 1, 2, 3, 4, 5], [6, 7, 8, 9, 10, 11]]
-    with pytest.raises(ValueError, match="every 3th frame"):
-        cut_clips(episodes(), 3, make_spec())
 
 
 class TruthfulProbe:
@@ -212,8 +192,10 @@ def test_episodes_of_unequal_length_are_refused_or_cut_and_no_clip_shows_a_frame
         load_clips([bag], 1)
     with pytest.raises(ValueError, match="no episode has 10 steps, the longest 8"):
         load_clips([bag], 2, 10)
+    with pytest.raises(ValueError, match="episodes of 4 steps cannot be cut at every 3th frame"):
+        load_clips([bag], 3, 4)
     clips, recorded = load_clips([bag], 2, 4), list(read_episodes(bag))
-    assert (len(clips), clips.seeds) == (2, (1000, 1003))
+    assert (len(clips), clips.seeds) == (2, (1000, 1003)) and clips.actions.shape[1:] == (2, 6)
     for row, episode in enumerate((recorded[0], recorded[3])):
         np.testing.assert_array_equal(clips.frames[row], episode.images[:5:2])
         np.testing.assert_array_equal(clips.actions[row].flatten(), episode.actions[:4].flatten())

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from wm_nodes.config.tasks import get_task
 from wm_nodes.core.specs import EnvironmentSpec
-from wm_nodes.core.types import Episode, FloatArray
+from wm_nodes.core.types import Episode, FloatArray, UInt8Array
 from wm_nodes.recording import read_episodes, read_spec
-from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
+from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.video_model import Condition
 from wm_nodes.video_model.conditions import hashed_words
 from wm_nodes.video_model.tokenizer_codec import Codec
@@ -89,18 +89,33 @@ def load_clips(bags: Sequence[Path], stride: int, steps: int = 0) -> Clips:
         BagError: a bag is missing, damaged, or of another version. ValueError: no episodes, of different sizes or
             lengths, or with an action or simulator state that is no number.
     """
-    episodes = [checked(episode, bag) for bag in bags for episode in read_episodes(bag)]
-    lengths = [episode.num_steps for episode in episodes]
+    frames, rest = list[UInt8Array](), list[Episode]()
+    for episode in (checked(episode, bag) for bag in bags for episode in read_episodes(bag)):
+        if episode.num_steps >= steps:
+            frames.append(episode.images[: (steps or episode.num_steps) + 1 : stride].copy())
+        rest.append(replace(episode, images=np.empty((len(episode.images), 0), np.uint8)))  # pictures fill the memory
+    lengths = [episode.num_steps for episode in rest]
     if not steps and len(set(lengths)) > 1:
         raise ValueError(
             f"episodes of {min(lengths)} to {max(lengths)} steps are no clips of one length; set clip_steps: longer "
             f"ones are cut there, shorter ones left out (a median of {sorted(lengths)[len(lengths) // 2]} steps)"
         )
-    episodes = [episode for episode in episodes if episode.num_steps >= steps]
-    if lengths and not episodes:
+    kept = [episode for episode in rest if episode.num_steps >= steps]
+    if lengths and not kept:
         raise ValueError(f"no episode has {steps} steps, the longest {max(lengths)}; lower clip_steps")
-    tasks = [episode.task for episode in episodes[:1]]
-    return cut_clips(stack_episodes(episodes, tasks, num_steps=steps or None), stride, read_spec(bags[0]))
+    if len(sizes := {some.shape[1:] for some in frames}) > 1:
+        raise ValueError(f"episodes of different picture sizes cannot be mixed: {sorted(sizes)}")
+    stacked = stack_episodes(kept, [episode.task for episode in kept[:1]], num_steps=steps or None)
+    if stacked.num_steps % stride:
+        raise ValueError(
+            f"episodes of {stacked.num_steps} steps cannot be cut at every {stride}th frame; choose a divisor"
+        )
+    actions = stacked.actions.reshape(len(stacked), stacked.num_steps // stride, -1)
+    return Clips(
+        frames=torch.from_numpy(np.stack(frames)), actions=torch.from_numpy(np.ascontiguousarray(actions)),
+        ground_truth=stacked.ground_truth[:, ::stride], instructions=stacked.instructions, task=stacked.tasks[0],
+        seeds=stacked.seeds, states=stacked.states[:, ::stride], spec=read_spec(bags[0]),
+    )
 
 
 def checked(episode: Episode, bag: Path) -> Episode:
@@ -122,18 +137,3 @@ def checked(episode: Episode, bag: Path) -> Episode:
         return episode
     names = get_task(episode.task).ground_truth_names
     return replace(episode, ground_truth=np.full((len(episode.images), len(names)), np.nan, np.float32))
-
-
-def cut_clips(episodes: EpisodeArrays, stride: int, spec: EnvironmentSpec) -> Clips:
-    """Cut every stride-th frame of each episode, from its first one. Raises ValueError where their steps are no
-    multiple of the stride. episodes: of one length, none padded."""
-    steps = episodes.num_steps
-    if steps % stride:
-        raise ValueError(f"episodes of {steps} steps cannot be cut at every {stride}th frame; choose a divisor")
-    actions = episodes.actions.reshape(len(episodes), steps // stride, -1)
-    return Clips(
-        frames=torch.from_numpy(np.ascontiguousarray(episodes.images[:, ::stride])),
-        actions=torch.from_numpy(np.ascontiguousarray(actions)), ground_truth=episodes.ground_truth[:, ::stride],
-        instructions=episodes.instructions, task=episodes.tasks[0], seeds=episodes.seeds,
-        states=episodes.states[:, ::stride], spec=spec,
-    )
