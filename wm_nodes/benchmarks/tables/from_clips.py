@@ -2,6 +2,8 @@
 
 from statistics import mean
 
+from benchmarks.environments.roboscape import success_of
+from benchmarks.tables.roboscape import DOMAINS
 from benchmarks.tables.table import Rows, percent, points, read
 
 FILE, PLANNED = "policy_rl_from_clips.json", ("planned demonstrations", 4)
@@ -20,4 +22,16 @@ def clones() -> Rows:
         yield (
             start, episodes, ", ".join(str(one["seed"]) for one in of), ", ".join(map(percent, clone)),
             percent(mean(clone)), ", ".join(map(percent, after)), points(first, last) if pairs else "",
+        )
+
+
+def scenes() -> Rows:
+    """In the procedural scenes; after RL where there was any."""
+    rows = read("policy_rl_from_clips_scenes.json")["rows"]
+    for start in dict.fromkeys(row["start"] for row in rows):
+        of = {row["model"]: row for row in rows if row["start"] == start}
+        yield (
+            start, of["sft"]["config"]["sft"]["num_demonstrations"],
+            *(f"{success_of(of[training], domain):.1f}" if training in of else ""
+              for training in ("sft", "world_model") for domain in DOMAINS),
         )

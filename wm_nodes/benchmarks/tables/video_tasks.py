@@ -92,7 +92,9 @@ def closed_loop() -> Rows:
         better = mean(one["evaluations"][-1]["win"] for one in trained)
         yield name, len(trained), f"{trained[0]['learning_rate']:g}", *gained(trained, CHANGES), f"{100 * better:.0f}"
     rows = [one for trained in trainings.values() for one in trained]
-    for name, base in (("CPS 0.4", "recordings"), ("DynDiff 0.54 gated, rms", "CPS 0.4")):
+    for name, base in (
+        ("CPS 0.4", "recordings"), ("DynDiff 0.54 gated, rms", "CPS 0.4"), ("best of n and recordings", "CPS 0.4"),
+    ):
         if pair := compare_samplers(rows, name, base, ["error_cm"]):
             found = pair.differences["error_cm"]
             apart = interval(found.mean, found.low, found.high, 2)
@@ -143,11 +145,11 @@ def ranking() -> Rows:
 def models_compared() -> Rows:
     rows = read(TRAINED_IN)["rows"]
     after = {(one["model"], one["seed"]): one["success_after"] for one in rows}
-    seeds = sorted({one["seed"] for one in rows})
     for better, base in (
         (AFTER_CPS, BEFORE), (AFTER_CPS, AFTER_RECORDINGS), (AFTER_RECORDINGS, BEFORE),
         (f"{BEFORE}, threshold 0.9", BEFORE), ("world model", AFTER_CPS),
     ):
+        seeds = [seed for model, seed in after if model == better and (base, seed) in after]
         won, base_won = ([x for seed in seeds for x in after[model, seed]] for model in (better, base))
         rates = [100 * (mean(after[better, seed]) - mean(after[base, seed])) for seed in seeds]
         yield f"{better} - {base}", len(won), points(base_won, won), over_seeds(rates, 1)
