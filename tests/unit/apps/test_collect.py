@@ -1,6 +1,7 @@
 """`wm collect` in the simulator: an interrupted collection goes on, the index and the table tell what was collected."""
 
 import csv
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,11 @@ def test_an_interrupted_collection_goes_on_and_gives_what_one_in_one_go_gives(
     assert all(row["scene"] in (interrupted / "success.txt").read_text() for row in rows)
     assert main(arguments(whole, episodes=2)) == 2
     assert "was begun with num_episodes 3, not 2; take another folder" in capsys.readouterr().err
+
+    plan = json.loads((whole / "push" / "plan.json").read_text())
+    plan.pop("recovers")
+    (whole / "push" / "plan.json").write_text(json.dumps(plan))
+    assert main(arguments(whole)) == 0, "a folder that was begun before a setting was known"
 
     short = whole / "push" / "shard_00000002"
     assert main(arguments(whole, episodes=4)) == 2

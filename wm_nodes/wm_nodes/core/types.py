@@ -81,7 +81,8 @@ class Environment(Protocol):
 
 
 RECOVERY, TAKEN_OVER = "recovery", "taken_over"
-"""Episode.behaviour of an episode that a policy began and an expert ended; Episode.extra[TAKEN_OVER] is his first step.
+"""Episode.behaviour of an episode that a policy began and an expert ended; Episode.extra[TAKEN_OVER] is the expert's
+first step.
 """
 
 

@@ -114,14 +114,14 @@ def keep_plan(plan: CollectionPlan, folder: Path) -> None:
     path, text = folder / PLAN, json.dumps({**vars(plan), "simulation": plan.simulation.model_dump()}, default=str)
     if path.exists() and path.read_text(encoding="utf-8") != text:
         kept, now = json.loads(path.read_text(encoding="utf-8")), json.loads(text)
-        others = [name for name in now if now[name] != kept.get(name)]
+        others = [name for name, value in now.items() if kept.get(name, value) != value]
         count, wanted = kept.get("num_episodes", 0), plan.num_episodes
-        if others != ["num_episodes"] or wanted < count:
+        if others and (others != ["num_episodes"] or wanted < count):
             name, value = others[0], now[others[0]]
             raise ValueError(f"{folder} was begun with {name} {kept.get(name)}, not {value}; take another folder")
         short = count % collection.EPISODES_PER_SHARD
         last = folder / f"shard_{plan.first_seed + count - short:08d}"
-        if short and last.exists():
+        if others and short and last.exists():
             raise ValueError(f"{last} holds the last {short} of {count} episodes; delete it to go on to {wanted}")
     write_atomic(path, text.encode())
 
