@@ -1,7 +1,7 @@
 """The end of a run of loop 2: held-out scores before and after, pictures, summary.json, report.html, the table."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +42,7 @@ from wm_nodes.world_model.position_probe import PositionProbe
 
 AFTER, UNREWARDED = (Path("evaluations") / name for name in ("after.json", "unrewarded.json"))
 STRIPS = 3
+UNKNOWN = "the probe does not read what it asks for, or the recordings do not hold it"
 
 
 def conclude(
@@ -66,18 +67,18 @@ def conclude(
             load_config("cpu", {"task": config.task}).simulation,
         ),
     )
+    known = known_scores(before, after)
+    missing = {name: UNKNOWN for name in TITLES if name in before and name not in known}
     lines = read_metrics(run_dir, SECTION) if (run_dir / FILE_NAME).is_file() else []
     watched = [line for line in lines if line.get("hacked") is not None]
     summary = as_first_made(run_dir, ClipSummary(
         task=config.task, preset=preset, seed=config.seed, iterations=iterations, version=version,
         contexts=len(before["success"]),
-        scores={
-            name: score_change(name, before[name], after[name], config.seed) for name in TITLES if name in before
-        },
+        scores={name: score_change(name, before[name], after[name], config.seed) for name in known},
         unrewarded={
             name: score_change(name, found.before[name], found.after[name], config.seed) for name in found.before
         },
-        executed=len(found.before.get("executed_success", ())), not_measured=found.missing,
+        executed=len(found.before.get("executed_success", ())), not_measured=missing | found.missing,
         evaluations=len(lines), watched=[name for name in WATCHED if watched and name in watched[-1]],
         hacked=None if not watched else [
             {"step": line["step"], "reward_slope": line["reward_slope"], "slopes": hacked_slopes(line),
@@ -98,6 +99,12 @@ def conclude(
     for alarm in summary.hacked or ():
         console.print(f"[bold yellow]reward hacking[/] after {alarm['step']} buffers: {alarm['text']}", highlight=False)
     console.print(f"report   {report}\nsummary  {path}\nbag      {summary.bag}", highlight=False)
+
+
+def known_scores(before: Mapping[str, Sequence[float]], after: Mapping[str, Sequence[float]]) -> list[str]:
+    """Which scores are numbers in every context; success, say, is none where a task's rule asks for what no probe
+    reads."""
+    return [name for name in TITLES if name in before and np.isfinite([*before[name], *after[name]]).all()]
 
 
 def score_change(name: str, before: Sequence[float], after: Sequence[float], seed: int) -> ScoreChange:
