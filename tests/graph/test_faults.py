@@ -232,7 +232,7 @@ def test_fifty_start_stop_cycles_leave_no_shared_memory(graph: Graph) -> None:
         "    others = set().union(*(mapped(name) for name in processes() if name != str(os.getpid())))\n"
         "    own = [path for path in ever - others if not re.search('fastrtps_port7[0-3]..$', path)]\n"
         "    left = [os.stat(path).st_size for path in own if os.path.exists(path)]\n"
-        "    print(len(own), len(left), sum(left))\n"
+        "    print('left', len(own), len(left), sum(left), flush=True)\n"
     )
     before = shm_files()
     given = {
@@ -245,8 +245,10 @@ def test_fifty_start_stop_cycles_leave_no_shared_memory(graph: Graph) -> None:
     assert done.returncode == 0, done.stderr
     ports = range(7400 + 250 * graph.domain, 7400 + 250 * (graph.domain + 1))
     assert not {name for name in shm_files() - before if name in {f"fastrtps_port{port}" for port in ports}}
-    rows = (map(int, line.split()) for line in done.stdout.splitlines())
+    said = (line.split() for line in done.stdout.splitlines())  # Fast DDS warns there, too, on a busy host
+    rows = [[*map(int, words[1:])] for words in said if words[:1] == ["left"]]
+    assert len(rows) == 50, done.stdout
     seen, files, sizes = zip(*rows, strict=True)
-    assert len(files) == 50 and seen[-1] >= 50, "the shared memory of the cycles was not seen"
+    assert seen[-1] >= 50, "the shared memory of the cycles was not seen"
     assert files[-1] - files[4] <= 2, f"shared-memory files after each cycle: {files}"
     assert sizes[-1] - sizes[4] <= 2**20, f"bytes of shared memory after each cycle: {sizes}"
