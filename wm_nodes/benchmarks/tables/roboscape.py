@@ -135,17 +135,16 @@ def clones() -> Rows:
 
 def recoveries() -> Rows:
     """Beside the clones of Table 1 those of as many demonstrations more, or recoveries."""
-    found = [*(row for task in (*TASKS, OURS) for row in trained(SFT, task)), *read(RECOVERIES)["rows"]]
-    learned = [(row["config"]["sft"]["num_demonstrations"], row["config"]["sft"].get("recoveries", 0)) for row in found]
-    for task in (*TASKS, OURS):
-        numbers = {its for row, its in zip(found, learned, strict=True) if row["task"] == task}
-        for demonstrations, more in sorted(numbers, key=lambda one: (sum(one), one)):
-            of = [row for row, its in zip(found, learned, strict=True)
-                  if row["task"] == task and its == (demonstrations, more)]
-            yield (
-                task, demonstrations, more or "", ", ".join(str(row["seed"]) for row in of),
-                *(by_seed([success_of(row, domain) for row in of]) for domain in DOMAINS),
-            )
+    tasks, groups = (*TASKS, OURS), dict[tuple[str, int, int], list[Run]]()
+    for row in (*(row for task in tasks for row in trained(SFT, task)), *read(RECOVERIES)["rows"]):
+        sft = row["config"]["sft"]
+        groups.setdefault((row["task"], sft["num_demonstrations"], sft.get("recoveries", 0)), []).append(row)
+    for task, count, more in sorted(groups, key=lambda one: (tasks.index(one[0]), one[1] + one[2], one)):
+        of = groups[task, count, more]
+        yield (
+            task, count, more or "", ", ".join(str(row["seed"]) for row in of),
+            *(by_seed([success_of(row, domain) for row in of]) for domain in DOMAINS),
+        )
 
 
 def extreme() -> Rows:

@@ -101,8 +101,7 @@ def best_and_worst(rewards: Tensor, group_ids: Tensor) -> tuple[Tensor, Tensor]:
 class BestAndRecorded(RecordedContexts):
     """Of each group the clip of highest reward trains, and as much the context's recording, in the row of the lowest.
 
-    Without recordings flow matching on own clips diverges: made in a few steps, they vary less than recorded ones, and
-    each buffer less than the one before.
+    Without recordings flow matching on own clips diverges: made in a few steps, they vary less than recorded ones.
     """
 
     def score(self, request: GroupRequest, clips: RolloutBuffer) -> RolloutBuffer:

@@ -8,7 +8,7 @@ import functools
 import multiprocessing as mp
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +16,12 @@ import torch
 
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.config.seed_ranges import EVALUATION
-from wm_nodes.config.tasks import simulator_part
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.core.types import RECOVERY, TAKEN_OVER, Episode, FloatArray, Observation
+from wm_nodes.core.types import Episode, FloatArray, Observation
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.episodes import EXTREME as EXTREME
-from wm_nodes.environments.maniskill.episodes import Act, planned_or_scripted_episode, record_episode
+from wm_nodes.environments.maniskill.episodes import planned_or_scripted_episode, record_episode, recovered_episode
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner
 
 EPISODES_PER_SHARD = 50
@@ -144,26 +143,7 @@ def _make_policy_actor(env: ManiSkillEnvironment, plan: CollectionPlan) -> Calla
             return policy(observation, seed)
 
         if plan.recovers:
-            return _recovered_episode(env, act, seed, episode_id)
+            return recovered_episode(env, act, seed, episode_id)
         return record_episode(env, act, plan.policy_label, seed, episode_id, plan.policy_version)
 
     return act_episode
-
-
-def _recovered_episode(env: ManiSkillEnvironment, begin: Act, seed: int, episode_id: int) -> Episode:
-    """An episode of a freshly reset environment that `begin` acts, and the task's script, as after a reset, from a step
-    on that follows from `seed`."""
-    rng = numpy_stream(seed, RECOVERY)
-    first, script = int(rng.integers(1, max(2, env.spec.max_episode_steps // 2))), simulator_part(env.spec.task).script
-    scripted: Callable[[FloatArray, FloatArray], FloatArray] | None = None
-
-    def act(observation: Observation, truth: FloatArray) -> FloatArray:
-        nonlocal scripted
-        if observation.episode_step[0] < first:
-            return begin(observation, truth)
-        if scripted is None:
-            scripted = script("expert", truth, rng, env.spec.action_scale[0])
-        return scripted(truth, observation.state[0, : env.spec.tool_dim])
-
-    episode = record_episode(env, act, RECOVERY, seed, episode_id)
-    return replace(episode, extra={**episode.extra, TAKEN_OVER: first})

@@ -12,7 +12,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT, STARTS, SeedRange, demonstration_seeds
 from wm_nodes.config.tasks import get_task, model_tasks, recorded_task
 from wm_nodes.core.files import write_atomic
-from wm_nodes.core.types import RECOVERY, Episode
+from wm_nodes.core.types import Episode
 from wm_nodes.environments import collection
 from wm_nodes.environments.collection import CollectionPlan, PolicyAct, collect
 from wm_nodes.environments.maniskill.spec import simulation_spec
@@ -89,7 +89,7 @@ def recovery_plan(config: RunConfig, make_policy: Callable[[], PolicyAct], plann
     demonstrations are planned; on the reset seeds that follow theirs, of which there are `planned`."""
     count = 2 * config.sft.recoveries
     plan = demonstration_plan(config, count, demonstration_seeds(config.seed, planned + count) + planned)
-    return replace(plan, behaviours={}, make_policy=make_policy, policy_label=RECOVERY, recovers=True)
+    return replace(plan, behaviours={}, make_policy=make_policy, recovers=True)
 
 
 def first_frames_plan(config: RunConfig, num_episodes: int) -> CollectionPlan:

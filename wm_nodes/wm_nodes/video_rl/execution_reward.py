@@ -19,13 +19,13 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import EXECUTION
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
-from wm_nodes.core.specs import MODEL_FIELDS, EnvironmentSpec, agree, spec_of_values, tool_spec
+from wm_nodes.core.specs import MODEL_FIELDS, EnvironmentSpec, agree, tool_spec
 from wm_nodes.core.tool_control import hold_actions, moves_pose
 from wm_nodes.core.types import FloatArray
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.world_model import DeviceEnvironment, WorldModels, load_model_folder
-from wm_nodes.world_model.folder import read_world_manifest
+from wm_nodes.world_model.folder import model_spec, read_world_manifest
 from wm_nodes.world_model.imagined_episodes import imagined_spec
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.positions import columns_of, probe_targets
@@ -70,7 +70,7 @@ def check_execution(config: VideoRlConfig, recordings: Clips) -> Path:
     if recordings.task not in manifest["tasks"]:
         raise ValueError(f"{model_dir} knows the tasks {', '.join(manifest['tasks'])}, not {recordings.task!r}; name "
                          "another execution.model")
-    spec = spec_of_values(manifest["spec"])
+    spec = model_spec(model_dir, manifest)
     remedy = "name another execution.model, or draw contexts from recordings that this one was trained with"
     agree(tool_spec(recordings.spec), spec, f"{model_dir} was trained with", MODEL_FIELDS, simulated=remedy)
     check_followable(spec, recordings)

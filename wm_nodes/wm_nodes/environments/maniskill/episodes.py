@@ -10,7 +10,7 @@ from wm_nodes.config.tasks import simulator_part, success
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.tool_control import moves_pose
-from wm_nodes.core.types import Episode, FloatArray, Observation
+from wm_nodes.core.types import RECOVERY, TAKEN_OVER, Episode, FloatArray, Observation
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner, PlanningError, follow, track
 from wm_nodes.environments.maniskill.pose_behaviours import PLANNED, vary
@@ -36,6 +36,25 @@ def scripted_episode(env: ManiSkillEnvironment, behaviour: str, seed: int, episo
         return scripted(truth_now, observation.state[0, : env.spec.tool_dim])
 
     return record_episode(env, act, behaviour, seed, episode_id)
+
+
+def recovered_episode(env: ManiSkillEnvironment, begin: Act, seed: int, episode_id: int) -> Episode:
+    """An episode of a freshly reset environment that `begin` acts, and the task's script, as after a reset, from a step
+    on that follows from `seed`."""
+    rng = numpy_stream(seed, RECOVERY)
+    first, script = int(rng.integers(1, max(2, env.spec.max_episode_steps // 2))), simulator_part(env.spec.task).script
+    scripted: Callable[[FloatArray, FloatArray], FloatArray] | None = None
+
+    def act(observation: Observation, truth: FloatArray) -> FloatArray:
+        nonlocal scripted
+        if observation.episode_step[0] < first:
+            return begin(observation, truth)
+        if scripted is None:
+            scripted = script("expert", truth, rng, env.spec.action_scale[0])
+        return scripted(truth, observation.state[0, : env.spec.tool_dim])
+
+    episode = record_episode(env, act, RECOVERY, seed, episode_id)
+    return replace(episode, extra={**episode.extra, TAKEN_OVER: first})
 
 
 def extreme_actions(rng: np.random.Generator, action_dim: int) -> Callable[[FloatArray, FloatArray], FloatArray]:
