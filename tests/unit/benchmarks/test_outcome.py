@@ -29,23 +29,24 @@ def test_the_command_trains_measures_the_kept_weights_and_goes_on_where_its_file
     (bag,) = collect_plan(scripted_plan(scene, 3, HELDOUT), scene, tmp_path / "bags")
     path, kept = tmp_path / "found.json", tmp_path / "weights"
     call = [
-        "benchmark", "outcome", "--context-bags", str(bag), "--heldout-bags", str(bag), "--iterations", "1",
-        "--eval-contexts", "2", "--weights", str(kept), "--json", str(path), "--samplers", *ARMS,
+        "benchmark", "outcome", "--context-bags", str(bag), "--heldout-bags", str(bag), "--iterations", "2",
+        "--eval-contexts", "2", "--weights", str(kept), "--measure-every", "1", "--json", str(path),
+        "--samplers", *ARMS,
     ]
     assert main([*call, "--seeds", "0"]) == 0
     first = rows_of(path)
     assert [row["sampler"] for row in first] == ARMS
     for row in first:
         assert len(row["evaluations"]) == 2
-        assert set(row["measured_before"]) == set(row["measured_after"]) == {*METRICS, *DONE}
-        assert row["measured_before"] == first[0]["measured_before"], "all arms begin with the same model"
+        assert [int(buffers) for buffers in row["measured"]] == [0, 1, 2]
+        assert all(set(found) == {*METRICS, *DONE} for found in row["measured"].values())
+        assert row["measured"]["0"] == first[0]["measured"]["0"], "all arms begin with the same model"
     assert first[0]["plan"]["rewards"] == [["outcome", 1.0]] and first[2]["plan"]["rewards"] == [["agent", 1.0]]
     assert first[3]["plan"]["rewards"] == [["execution", 1.0], ["outcome", 0.3]]
-    assert {file.name for file in kept.iterdir()} == {
-        "CPS_0.4_0.safetensors", "signed_FM_ODE_0.safetensors", "CPS_0.4_judge_robot_0.safetensors",
-        "CPS_0.4_execution_and_outcome_0.safetensors",
-    }
-    assert len({file.read_bytes() for file in kept.iterdir()}) == 4, "two arms are the same training"
+    names = ("CPS_0.4", "signed_FM_ODE", "CPS_0.4_judge_robot", "CPS_0.4_execution_and_outcome")
+    files = {f"{name}_0_{buffers}.safetensors" for name in names for buffers in (1, 2)}
+    assert {file.name for file in kept.iterdir()} == files
+    assert len({file.read_bytes() for file in kept.iterdir()}) == 8, "two arms are the same training"
     assert (tmp_path / "found_proxy.png").is_file()
     assert "executed_success" in METRICS and "metrics that nothing trained on" in capsys.readouterr().out
     assert main([*call[:-len(ARMS)], ARMS[0], "--seeds", "0", "1"]) == 0

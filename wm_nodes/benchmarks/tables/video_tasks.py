@@ -10,7 +10,6 @@ from wm_nodes.core.statistics import t_975
 
 OUTCOME, EARLY, JUDGED = (f"video_rl_outcome{of}.json" for of in ("", "_early", "_judge"))
 EXECUTED, MIXED = "video_rl_outcome_execution.json", "video_rl_outcome_mixed.json"
-AFTER = "measured_after"
 CLOSED_LOOP, LONGER, TRAINED_IN = (f"video_rl_closed_loop{of}" for of in (".jsonl", "_history.json", "_policies.json"))
 BEFORE, AFTER_CPS, AFTER_RECORDINGS = (f"video model {of}" for of in ("before", "after CPS", "after recordings"))
 PROBE_PAID, JUDGE_PAID = "CPS 0.4", "CPS 0.4, judge robot"
@@ -36,11 +35,11 @@ def outcome() -> Rows:
 
 
 def unpaid() -> Rows:
-    rows = [one for one in read(OUTCOME)["rows"] + read(JUDGED)["rows"] if "measured_after" in one]
+    rows = [one for one in read(OUTCOME)["rows"] + read(JUDGED)["rows"] if "measured" in one]
     for name, trained in samplers(rows).items():
         cells = []
         for metric, digits in UNPAID:
-            before, after = ([one[f"measured_{when}"][metric] for one in trained] for when in ("before", "after"))
+            before, after = ([one["measured"][when][metric] for one in trained] for when in ("0", "15"))
             changed = over_seeds([later - first for first, later in zip(before, after, strict=True)], digits)
             cells.append(f"{mean(before):.{digits}f} {changed}")
         yield name, len(trained), *cells
@@ -49,13 +48,13 @@ def unpaid() -> Rows:
 def executed() -> Rows:
     rows = sorted(read(OUTCOME)["rows"] + read(JUDGED)["rows"], key=lambda one: int(one["seed"]))
     judged = samplers(rows)[JUDGE_PAID]
-    judge, probe = ([one["measured_after"]["executed_success"] for one in samplers(rows)[name]]
+    judge, probe = ([one["measured"]["15"]["executed_success"] for one in samplers(rows)[name]]
                     for name in (JUDGE_PAID, PROBE_PAID))
     change, (a, b) = mean(judge) - mean(probe), (variance(some) / len(some) for some in (judge, probe))
     freedom = (a + b) ** 2 / (a**2 / (len(judge) - 1) + b**2 / (len(probe) - 1))
     half, cells = t_975(int(freedom)) * math.sqrt(a + b), []
-    for when in ("before", "after"):
-        accepted, real = (mean(one[f"measured_{when}"][key] for one in judged) for key in ACCEPTED)
+    for when in ("0", "15"):
+        accepted, real = (mean(one["measured"][when][key] for one in judged) for key in ACCEPTED)
         cells += [percent(accepted), percent(real / accepted)]
     first = probe[: len(judge)]
     for paid_by, values, apart in (
@@ -68,15 +67,15 @@ def executed() -> Rows:
 
 def execution_paid() -> Rows:
     paid, mixed = (read(file)["rows"] for file in (EXECUTED, MIXED))
-    probe = {one["seed"]: one["measured_after"] for one in read(OUTCOME)["rows"] if one["sampler"] == PROBE_PAID}
+    probe = {one["seed"]: one["measured"]["15"] for one in read(OUTCOME)["rows"] if one["sampler"] == PROBE_PAID}
     for name, trained, when in (
-        ("action world model, 15 buffers", paid, "measured_15"), ("action world model, 20 buffers", paid, AFTER),
-        ("and 0.3 of the outcome, 20 buffers", mixed, AFTER), ("probe, 15 buffers", paid, ""),
+        ("action world model, 15 buffers", paid, "15"), ("action world model, 20 buffers", paid, "20"),
+        ("and 0.3 of the outcome, 20 buffers", mixed, "20"), ("probe, 15 buffers", paid, ""),
     ):
         probes = [probe[one["seed"]] for one in trained]
-        after = [one[when] for one in trained] if when else probes
+        after = [one["measured"][when] for one in trained] if when else probes
         real = [one["executed_success"] for one in after]
-        gains = [now - one["measured_before"]["executed_success"] for now, one in zip(real, trained, strict=True)]
+        gains = [now - one["measured"]["0"]["executed_success"] for now, one in zip(real, trained, strict=True)]
         apart = [now - one["executed_success"] for now, one in zip(real, probes, strict=True)]
         kinds = [mean(one.get(kind, math.nan) for one in after) for kind in ("success", "execution_success")]
         yield (

@@ -21,7 +21,7 @@ from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers
 from benchmarks.video_rl.sources import TASK, RecordedSource, config_of
 from benchmarks.video_rl.spread import reward_spread
-from benchmarks.video_rl.trainings import OnIteration, RecordedTrainings, row_name
+from benchmarks.video_rl.trainings import OnIteration, RecordedTrainings, training_name
 from benchmarks.video_rl.trials import SamplerTrial
 from wm_nodes.config.seed_ranges import seed_spans
 from wm_nodes.config.shipped import shipped_model
@@ -179,7 +179,8 @@ class ClosedLoop(RecordedTrainings[ClosedLoopPlan]):
         probe = load_probe(shipped_model(TASK), self.where)
         row = train_arm(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed, on_iteration)
         if self.models:
-            _keep_model(self.models / row_name(row), folder, self.video_model, row, seed_spans(contexts.seeds))
+            path = self.models / training_name(trial.sampler.name, seed)
+            _keep_model(path, folder, self.video_model, row, seed_spans(contexts.seeds))
         return row
 
     def pairs(self, rows: list[dict[str, Any]]) -> list[tuple[str, str]]:

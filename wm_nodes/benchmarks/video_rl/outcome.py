@@ -2,11 +2,13 @@
 on held-out first frames, with scores that nothing was trained on.
 """
 
+from collections import defaultdict
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import count
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, ClassVar
@@ -24,7 +26,7 @@ from benchmarks.video_rl.proxy_plot import plot_proxy
 from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers, paper_samplers
 from benchmarks.video_rl.sources import TASK, config_of
 from benchmarks.video_rl.spread import group_spread
-from benchmarks.video_rl.trainings import OnIteration, RecordedTrainings, row_name
+from benchmarks.video_rl.trainings import OnIteration, RecordedTrainings, training_name
 from benchmarks.video_rl.trials import PAPER_GROUP, SamplerTrial
 from wm_nodes.apps.options import prepare_torch
 from wm_nodes.config.load import judge_or_embedded, load_config, load_video_config
@@ -108,6 +110,8 @@ class Outcome(RecordedTrainings[OutcomePlan]):
     """Held-out first frames."""
     weights: Path | None = None
     """Keep the trained weights in this folder, and measure them by what nothing was trained on."""
+    measure_every: Count | None = None
+    """Buffers between weights that are kept and measured; without, those after the last one only."""
 
     measures: ClassVar = MEASURES
 
@@ -120,36 +124,44 @@ class Outcome(RecordedTrainings[OutcomePlan]):
         folder = self.folder()
         contexts, heldout = self.recordings(folder, trial.plan.eval_contexts)
         probe, fps = load_probe(shipped_model(TASK), self.where), clip_fps(self.context_bags[0], folder.clip["stride"])
+        buffers = count(1)
+
+        def keep() -> None:
+            trained = next(buffers)
+            if self.weights and trained in self.measured(trial.plan):
+                path = self.weights / weights_name(trial.sampler.name, seed, trained)
+                write_atomic(path, pack_weights(folder.network).data)
+            on_iteration()
+
         with OutcomeSource(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed, fps) as source:
-            row = train_sampler(source, trial.sampler, trial.plan, seed, on_iteration)
-        if self.weights:
-            write_atomic(self.weights / f"{row_name(row)}.safetensors", pack_weights(folder.network).data)
+            row = train_sampler(source, trial.sampler, trial.plan, seed, keep)
         return {name: value for name, value in row.items() if name not in ("before", "after")}
 
+    def measured(self, plan: OutcomePlan) -> list[int]:
+        """After which buffers weights are measured."""
+        return sorted({*range(0, plan.iterations, self.measure_every or plan.iterations), plan.iterations} - {0})
+
     def train_all(self) -> list[dict[str, Any]]:
-        """The rows, with what measure_weights finds, `measured_before` and `measured_after`, where weights are kept."""
+        """The rows; where weights are kept with `measured`, what measure_weights finds, by the number of buffers."""
         rows = super().train_all()
-        todo = [row for row in rows if self.weights and "measured_after" not in row]
-        if not todo:
+        if not self.weights:
             return rows
-        before = {row["seed"]: row["measured_before"] for row in rows if "measured_before" in row}
+        plans = {trial.sampler.name: trial.plan for trial in self.trials()}
+        todo = defaultdict[tuple[Path | None, int], list[tuple[dict[str, Any], str]]](list)
+        for row in rows:
+            name, seed = row["sampler"], row["seed"]
+            for buffers in (0, *self.measured(plans[name])):
+                if str(buffers) not in row.setdefault("measured", {}):
+                    weights = self.weights / weights_name(name, seed, buffers) if buffers else None
+                    todo[weights, seed].append((row["measured"], str(buffers)))
         with (
             ProcessPoolExecutor(self.workers, mp_context=get_context("spawn"), initializer=prepare_torch) as pool,
-            tqdm(total=len(todo), desc="held-out metrics", unit="training") as bar,
+            tqdm(total=len(todo), desc="held-out metrics", unit="model") as bar,
         ):
-            bases = {
-                seed: pool.submit(self.measure_weights, None, seed)
-                for seed in dict.fromkeys(row["seed"] for row in todo) if seed not in before
-            }
-            trained = {
-                pool.submit(self.measure_weights, self.weights / f"{row_name(row)}.safetensors", row["seed"]): row
-                for row in todo if self.weights
-            }
-            for future in as_completed(trained):
-                row = trained[future]
-                seed = row["seed"]
-                row["measured_before"] = before[seed] if seed in before else bases[seed].result()
-                row["measured_after"] = future.result()
+            running = {pool.submit(self.measure_weights, *model): places for model, places in todo.items()}
+            for future in as_completed(running):
+                for measured, at in running[future]:
+                    measured[at] = future.result()
                 bar.update()
                 self.write_rows(rows)
         return rows
@@ -224,6 +236,11 @@ def paid_trials(sampler: SamplerSetup, plan: OutcomePlan) -> list[SamplerTrial[O
         SamplerTrial(replace(sampler, name=f"{sampler.name}, {name}"), replace(plan, rewards=weights))
         for name, weights in rewards.items()
     ]
+
+
+def weights_name(sampler: str, seed: int, buffers: int) -> str:
+    """The file of weights that were trained on so many buffers."""
+    return f"{training_name(sampler, seed)}_{buffers}.safetensors"
 
 
 @cache

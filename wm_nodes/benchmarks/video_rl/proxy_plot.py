@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.video_rl.tables import last_measured
 from wm_nodes.reports.figures import COLOURS, add_legend, make_figure, save_figure, style_axes
 
 MORE_COLOURS = ("#444444", "#c2a000", "#1fa0b0", "#b04080", "#7a4a1f", "#6fae2a")
@@ -23,8 +24,8 @@ def plot_proxy(rows: Sequence[dict[str, Any]], path: Path) -> None:
     for name, colour in zip(names, (*COLOURS, *MORE_COLOURS), strict=False):
         for row in (row for row in rows if row["sampler"] == name):
             paid = row["buffers"]["reward_mean"]
-            start = paid[0], row["measured_before"][EXECUTED]
-            end = float(np.mean(paid[-LAST:])), row["measured_after"][EXECUTED]
+            start = paid[0], row["measured"]["0"][EXECUTED]
+            end = float(np.mean(paid[-LAST:])), last_measured(row)[EXECUTED]
             axes.plot(*zip(start, end, strict=True), color=colour, alpha=0.35, linewidth=0.9)
             axes.plot(*start, "o", color=colour, markersize=4, fillstyle="none")
             axes.plot(*end, "o", color=colour, markersize=5)

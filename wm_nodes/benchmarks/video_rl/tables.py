@@ -1,6 +1,6 @@
 """The benchmark's tables on the console."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -86,11 +86,12 @@ def gain_table(rows: Sequence[dict[str, Any]], scores: Sequence[str] = GAINS) ->
 
 
 def measured_table(rows: Sequence[dict[str, Any]]) -> Table:
-    """One line per sampler: metrics that nothing trained on, mean over seeds before, and change with its interval."""
-    known = [row for row in rows if "measured_after" in row]
-    names, cells = tuple(known[0]["measured_after"]) if known else (), []
+    """One line per sampler: metrics that nothing trained on, mean over seeds before, and change after the last buffer,
+    with its interval."""
+    known = [row for row in rows if row.get("measured")]
+    names, cells = tuple(known[0]["measured"]["0"]) if known else (), []
     for sampler in dict.fromkeys(row["sampler"] for row in known):
-        mine = [(row["measured_before"], row["measured_after"]) for row in known if row["sampler"] == sampler]
+        mine = [(row["measured"]["0"], last_measured(row)) for row in known if row["sampler"] == sampler]
         texts = (
             f"{np.mean([before[name] for before, _ in mine]):.3f} "
             f"{_change_text([after[name] - before[name] for before, after in mine])}" for name in names
@@ -100,6 +101,12 @@ def measured_table(rows: Sequence[dict[str, Any]]) -> Table:
         "metrics that nothing trained on: mean before, and change with its 95 % t interval over seeds", ("sampler",),
         ("seeds", *names), cells,
     )
+
+
+def last_measured(row: Mapping[str, Any]) -> dict[str, float]:
+    """The metrics of a training after its last buffer."""
+    measured: dict[str, dict[str, float]] = row["measured"]
+    return measured[max(measured, key=int)]
 
 
 def comparison_table(comparisons: Sequence[SamplerComparison]) -> Table:

@@ -1,7 +1,7 @@
 """Trainings of several samplers at several seeds: run, kept in one file, compared."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
@@ -144,9 +144,9 @@ class RecordedTrainings(Trainings[Plan]):
         return [replace(one, grpo=one.grpo.with_values(learning_rate=self.learning_rate)) for one in setups]
 
 
-def row_name(row: Mapping[str, Any]) -> str:
-    """Sampler and seed of a row, as a file's name."""
-    return f"{row['sampler'].replace(',', '').replace(' ', '_')}_{row['seed']}"
+def training_name(sampler: str, seed: int) -> str:
+    """Sampler and seed, as a file's name."""
+    return f"{sampler.replace(',', '').replace(' ', '_')}_{seed}"
 
 
 def settings_of(samplers: list[SamplerSetup]) -> dict[str, Any]:
