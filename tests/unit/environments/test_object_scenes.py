@@ -1,6 +1,6 @@
 """The procedural scenes and their tasks in the simulator: control, repetition, pictures, rules, scripts."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -14,11 +14,11 @@ from wm_nodes.config.tasks import get_task, simulator_part, success
 from wm_nodes.core.rotations import multiply, to_quaternion
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.tool_control import hold_actions, next_state
-from wm_nodes.core.types import FloatArray
+from wm_nodes.core.types import TAKEN_OVER, FloatArray, Observation
 from wm_nodes.environments.maniskill.behaviours import ROBOT_BASE
 from wm_nodes.environments.maniskill.control import DOWN
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-from wm_nodes.environments.maniskill.episodes import scripted_episode
+from wm_nodes.environments.maniskill.episodes import recovered_episode, scripted_episode
 from wm_nodes.environments.maniskill.objects import BOTTOM, GRASPED, GROUND_TRUTH_NAMES, OPENING
 
 TASKS = ("push", "pull", "pick_place", "move_to_aim", "reach_object")
@@ -186,6 +186,28 @@ def test_the_script_of_a_task_succeeds_from_a_start_that_does_not(task: str) -> 
     with pytest.raises(ValueError, match=r"'dance'.*noisy"):
         scripted_episode(env, "dance", 1, 5)
     env.close()
+
+
+@pytest.mark.rendering
+@pytest.mark.parametrize("task", ["pick_place", "move_to_aim"])
+def test_a_script_that_takes_over_does_not_drop_what_the_fingers_hold(task: str) -> None:
+    environment = ManiSkillEnvironment(task, CONFIG.simulation, pictures=False)
+    scale, held = environment.spec.action_scale[0], []
+    for seed in range(8, 16):
+        start(environment, seed)
+        script = simulator_part(task).script("expert", environment.ground_truth[0], numpy_stream(seed, "script"), scale)
+
+        def begin(seen: Observation, now: FloatArray, script: Callable[..., FloatArray] = script) -> FloatArray:
+            return script(now, seen.state[0])
+
+        episode = recovered_episode(environment, begin, seed, seed)
+        taken_over = episode.extra[TAKEN_OVER]
+        if taken_over < episode.num_steps and episode.ground_truth[taken_over, GRASPED]:
+            held.append(bool(episode.success.any()))
+            let_go = np.flatnonzero(episode.ground_truth[taken_over:, GRASPED] == 0)
+            assert not let_go.size or episode.num_steps - taken_over - let_go[0] <= 3, "it let go on the way"
+    environment.close()
+    assert len(held) >= 3 and all(held)
 
 
 @pytest.mark.rendering

@@ -12,7 +12,7 @@ from wm_nodes.core.rotations import multiply, to_quaternion, to_vector
 from wm_nodes.core.types import FloatArray
 from wm_nodes.environments.maniskill import objects
 from wm_nodes.environments.maniskill.behaviours import ROBOT_BASE
-from wm_nodes.environments.maniskill.objects import CONTAINER, OBJECT
+from wm_nodes.environments.maniskill.objects import BOTTOM, CONTAINER, GRASPED, OBJECT
 from wm_nodes.environments.maniskill.table_top import GOAL
 
 OPEN, CLOSED = 1.0, -1.0
@@ -32,17 +32,19 @@ def waypoint(xy: FloatArray, z: float, yaw: float, gripper: float) -> FloatArray
 
 
 def grasp_waypoints(truth: FloatArray) -> list[FloatArray]:
-    """Above the object, down to it, closed, and up; the fingers close across the object's y axis."""
+    """Above the object, down to it, closed, and up; the fingers close across the object's y axis. Up alone where they
+    hold it already."""
     x_y, z, yaw = truth[OBJECT][:2], grasp_height(truth), grasp_yaw(truth)
-    return [
-        waypoint(x_y, z + TRAVEL_M, yaw, OPEN), waypoint(x_y, z, yaw, OPEN), waypoint(x_y, z, yaw, CLOSED),
-        waypoint(x_y, z + TRAVEL_M, yaw, CLOSED),
-    ]
+    up = waypoint(x_y, z + TRAVEL_M, yaw, CLOSED)
+    if truth[GRASPED]:
+        return [up]
+    return [waypoint(x_y, z + TRAVEL_M, yaw, OPEN), waypoint(x_y, z, yaw, OPEN), waypoint(x_y, z, yaw, CLOSED), up]
 
 
 def grasp_height(truth: FloatArray) -> float:
-    """Of the tool, m: the object's centre, with fingers clear of the table."""
-    return max(float(truth[OBJECT][2]), LEAST_GRASP_M)
+    """Of the tool, m: the centre of the object on the table, with fingers clear of that."""
+    lifted = float(truth[BOTTOM]) if truth[GRASPED] else 0.0
+    return max(float(truth[OBJECT][2]) - lifted, LEAST_GRASP_M)
 
 
 def grasp_yaw(truth: FloatArray) -> float:
