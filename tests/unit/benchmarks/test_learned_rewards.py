@@ -11,8 +11,16 @@ from model_folders import make_model_folder, write_starts
 from unit.benchmarks.test_reward_test import CONFIG, EPISODES, recorded
 
 from benchmarks.environments import learned_rewards, reward_test
-from benchmarks.environments.learned_rewards import EMBEDDING, PROXY, Learned, best_threshold, environment_paid_by
+from benchmarks.environments.learned_rewards import (
+    EMBEDDING,
+    PROXY,
+    Learned,
+    best_threshold,
+    environment_paid_by,
+    paid_by_verdicts,
+)
 from benchmarks.environments.reward_test import imagine_all, learned_heads
+from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl import factories
 from wm_nodes.policy_rl.factories import models_of
 
@@ -51,3 +59,29 @@ def test_the_environment_ends_where_the_learned_reward_says_so(
     value, shift = values[:, 0], config.reward.success_threshold - best_threshold(values[:, -1], seen.won)
     np.testing.assert_allclose(result.success_probability, value + shift, atol=2e-2)
     assert (result.terminated == (result.success_probability > config.reward.success_threshold)).all()
+
+
+def test_the_reward_agent_pays_the_last_step_of_each_whole_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Environment 0 succeeds at step 1 and is reset, then time is over; 1 is cut by the rollout's end."""
+    T, N = 6, 2
+    ended = np.zeros((3, T, N), np.bool_)
+    terminated, truncated, valid = ended[0], ended[1], ~ended[2]
+    terminated[1, 0], truncated[5, 0], valid[2, 0] = True, True, False
+    images = np.arange(T * N, dtype=np.uint8).reshape(T, N, 1, 1, 1)
+    some = np.ones((T, N), np.float32)
+    rollout = Rollout(
+        images_TN=images, next_images_TN=images + 100, states_TN=some[..., None], next_states_TN=some[..., None],
+        actions_TN=some[..., None], logprobs_TN=some, values_TN=some, rewards_TN=some, terminated_TN=terminated,
+        truncated_TN=truncated, valid_TN=valid, policy_version=1,
+    )
+    seen = list[list[int]]()
+
+    def pay(episodes: Any, _: Any) -> Any:
+        seen.extend(frames.ravel().tolist() for frames, _, _ in episodes)
+        assert all(len(frames) == len(actions) + 1 for frames, actions, _ in episodes)
+        return np.array([0.25, 0.75])
+
+    monkeypatch.setattr(learned_rewards, "paid_episodes", pay)
+    paid = paid_by_verdicts(rollout, "push", CONFIG).rewards_TN
+    assert seen == [[0, 2, 102], [6, 8, 10, 110]]
+    assert paid[1, 0] == 0.25 and paid[5, 0] == 0.75 and paid.sum() == 1

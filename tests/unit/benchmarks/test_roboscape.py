@@ -10,6 +10,7 @@ from model_folders import make_model_folder
 
 from benchmarks.environments.roboscape import (
     ALL_SCENES,
+    JUDGE,
     MANY,
     MODEL,
     ONE_SCENE,
@@ -78,20 +79,20 @@ def test_every_training_is_made_once_and_measured_in_and_out_of_domain(
 ) -> None:
     short = {"simulation.max_episode_steps": 20, "evaluation.episodes": 1, "acceptance.num_episodes": 2,
              "acceptance.clone_episodes": 2, "data.num_workers": 1, "sft.num_demonstrations": 1, "ppo.updates": 1,
-             "tokenizer.foreground": "background", "model_refresh.episodes_per_round": 1,
+             "tokenizer.foreground": "background", "ppo.num_steps": 20, "model_refresh.episodes_per_round": 1,
              "model_refresh.heldout_episodes": 2, "model_refresh.replay_episodes": 1,
              "model_refresh.refresh_iterations": 1, "model_refresh.own_starts": 0}
     model = make_model_folder(tmp_path / "model", load_config("smoke", {"task": "push", **short}))
     file = tmp_path / "rows.json"
     words = ["reproduce", "roboscape", "--preset", "smoke", "--model-dir", str(model), "--tasks", "push",
              "--seeds", "0", "--json", str(file), "--work", str(tmp_path / "work"), "--policy.inputs", "latents",
-             "--trainings", SFT, ONE_SCENE, ALL_SCENES, MODEL, REFRESHED,
+             "--trainings", SFT, ONE_SCENE, ALL_SCENES, MODEL, JUDGE, REFRESHED,
              *(word for name, value in short.items() for word in (f"--{name}", str(value)))]
     assert main(words) == 0
     rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
-    assert [one["model"] for one in rows] == [SFT, ONE_SCENE, ALL_SCENES, MODEL, REFRESHED]
+    assert [one["model"] for one in rows] == [SFT, ONE_SCENE, ALL_SCENES, MODEL, JUDGE, REFRESHED]
     assert all(one["success"].keys() == {scene_of_seed(0), *OOD} for one in rows)
-    assert [len(one["course"]) for one in rows] == [0, 1, 1, 1, 1] and rows[-2]["accepted"] is False
+    assert [len(one["course"]) for one in rows] == [0, 1, 1, 1, 1, 1] and rows[-2]["accepted"] is False
     assert rows[-1]["refresh"]["rows"][-1]["name"] == "done signal right"
     shown = capsys.readouterr().out
     assert "[0.0]" in shown and "RL in the simulator, all training scenes" in shown

@@ -4,7 +4,7 @@ Shapes: B batch, T steps, S tokens, D width, K done heads, J tasks, N environmen
 """
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,11 +20,17 @@ from benchmarks.environments.reward_test import (
     embedding_values,
     embedding_weights,
     episodes_learned_from,
+    paid_episodes,
     proxy_network,
     proxy_values,
 )
-from wm_nodes.core.types import BoolArray
-from wm_nodes.policy_rl.factories import imagined_by, models_of
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.types import BoolArray, Rollout
+from wm_nodes.judge.episode_reward import check_horizon
+from wm_nodes.policy_rl.factories import imagined_by, make_learner, models_of
+from wm_nodes.policy_rl.image_policy import ImagePolicy
+from wm_nodes.policy_rl.rollouts import collect_rollout, rollout_statistics, terminate_at_episode_end
+from wm_nodes.reward import RuleReward
 from wm_nodes.world_model import DeviceEnvironment, ImaginedEpisodes, WorldModels
 from wm_nodes.world_model.dynamics import pooled_features
 
@@ -117,3 +123,32 @@ def environment_paid_by(reward: Learned, place: Workplace, episodes: int, work: 
         make = partial(PaidByLatents, value=lambda features: network(features.float())[..., 0].sigmoid() + more)
     made = imagined_by(make, config, place.model_dir, place.start[0], config.ppo.num_envs)
     return ImaginedEpisodes(made, seed=config.seed)
+
+
+def train_by_verdicts(place: Workplace, policy: ImagePolicy, imagined: ImaginedEpisodes) -> Iterator[float]:
+    """Train in place, paid by the reward agent at the end of each episode (RA-15), as the graph is; the success rate of
+    each update's rollout, by the done signal. Raises ValueError as check_horizon and paid_episodes."""
+    config = place.config
+    check_horizon(config.ppo.num_steps, imagined.spec.max_episode_steps)
+    learner = make_learner(policy, config)
+    for version in range(1, config.ppo.updates + 1):
+        rollout = collect_rollout(imagined, policy, RuleReward(), config.ppo.num_steps, config.seed, version)
+        learner.update(terminate_at_episode_end(paid_by_verdicts(rollout, imagined.spec.instruction, config)))
+        yield rollout_statistics(rollout).success_rate
+
+
+def paid_by_verdicts(rollout: Rollout, instruction: str, config: RunConfig) -> Rollout:
+    """The rollout with the reward agent's reward at the last step of each episode that ended, and none elsewhere."""
+    rewards, ends, episodes = np.zeros_like(rollout.rewards_TN), list[tuple[int, int]](), []
+    for env in range(rewards.shape[1]):
+        first = 0
+        for step in range(len(rewards)):
+            if not rollout.valid_TN[step, env]:
+                first = step + 1
+            elif rollout.terminated_TN[step, env] or rollout.truncated_TN[step, env]:
+                frames = np.stack([*rollout.images_TN[first : step + 1, env], rollout.next_images_TN[step, env]])
+                episodes.append((frames, rollout.actions_TN[first : step + 1, env], instruction))
+                ends.append((step, env))
+    if ends:
+        rewards[tuple(np.array(ends).T)] = paid_episodes(episodes, config)
+    return replace(rollout, rewards_TN=rewards)

@@ -5,7 +5,7 @@ simulator says which episodes succeed. Shapes: E episodes, T steps, F features.
 """
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -196,27 +196,39 @@ def paid(
 
 
 def judged(found: Imagined, config: RunConfig) -> NDArray[np.float64]:
-    """What the reward agent pays, at the last step of an episode (E, T). By default the embedded judge, which learned
-    from recordings in which nothing is wrong.
+    """What the reward agent pays, at the last step of an episode (E, T); else as paid_episodes."""
+    lengths = found.real.lengths
+    episodes = [
+        (found.frames[row, : steps + 1], found.real.actions[row, :steps], found.real.instructions[row])
+        for row, steps in enumerate(map(int, lengths))
+    ]
+    at_end = np.arange(found.real.num_steps) >= lengths[:, None] - 1
+    return np.where(at_end, paid_episodes(episodes, config)[:, None], 0.0)
+
+
+def paid_episodes(
+    episodes: Sequence[tuple[UInt8Array, FloatArray, str]], config: RunConfig
+) -> NDArray[np.float64]:
+    """The reward agent's reward of whole episodes (E,). By default the embedded judge, which learned from recordings in
+    which nothing is wrong.
+
+    Args:
+        episodes: pictures (T + 1, H, W, 3), actions (T, A) and instruction of each.
 
     Raises:
         ValueError: it gives no verdict on more than MAX_INVALID_SHARE of them; on fewer, they are paid 0.
     """
     settings, jobs = episode_judge(config), list[ClipJob]()
-    for row, steps in enumerate(map(int, found.real.lengths)):
-        frames = found.frames[row, : steps + 1]
-        task = TaskSpec(found.real.instructions[row], config.task, settings.robot, frames[0], None,
-                        found.real.actions[row, :steps])
-        jobs.append(ClipJob(clip_ref(f"episode {row}", frames, config.simulation.control_hz), task))
+    for number, (frames, actions, instruction) in enumerate(episodes):
+        task = TaskSpec(instruction, config.task, settings.robot, frames[0], None, actions)
+        jobs.append(ClipJob(clip_ref(f"episode {number}", frames, config.simulation.control_hz), task))
     with closing(JudgeService(settings, seed=config.seed, device=config.device)) as judge:
         verdicts = judge.judge(jobs)
     silent = [verdict for verdict in verdicts if not verdict.valid]
     if len(silent) > MAX_INVALID_SHARE * len(verdicts):
         raise ValueError(f"the reward agent gives no verdict on {len(silent)} of {len(verdicts)} episodes: "
                          f"{silent[0].status} {silent[0].reason}; mend the judge, see --judge.*")
-    rewards = np.array([verdict.reward if verdict.valid else 0.0 for verdict in verdicts])
-    at_end = np.arange(found.real.num_steps) >= found.real.lengths[:, None] - 1
-    return np.where(at_end, rewards[:, None], 0.0)
+    return np.array([verdict.reward if verdict.valid else 0.0 for verdict in verdicts])
 
 
 def learned_heads(seen: Imagined, model_dir: Path, seed: int) -> dict[str, Callable[[Imagined], NDArray[np.float64]]]:

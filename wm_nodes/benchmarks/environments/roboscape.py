@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args
 
 from benchmarks.environments.experiments import Configured
 from benchmarks.environments.figures import draw_policies, extreme_table, measure_extreme
-from benchmarks.environments.learned_rewards import EMBEDDING, PROXY, Learned, environment_paid_by
+from benchmarks.environments.learned_rewards import EMBEDDING, PROXY, Learned, environment_paid_by, train_by_verdicts
 from benchmarks.environments.policies import SIMULATOR, WORLD_MODEL, Workplace, rate_of, rate_over_seeds, train_on
 from benchmarks.environments.reward_test import measure_rewards, rewards_table
 from benchmarks.experiment import Count, console
@@ -36,23 +36,24 @@ TASKS = ("pick_place", "push", "pull", "move_to_aim")
 MANY = "all_tasks"
 """Of each episode's task its policy is told; an episode's seed says which it is."""
 Training = Literal[
-    "sft", "one_scene", "all_scenes", "world_model", "refreshed", "goal", "progress", "embedding", "proxy"
+    "sft", "one_scene", "all_scenes", "world_model", "refreshed", "goal", "progress", "judge", "embedding", "proxy"
 ]
-SFT, ONE_SCENE, ALL_SCENES, MODEL, REFRESHED, GOAL, PROGRESS, *_ = get_args(Training)
+SFT, ONE_SCENE, ALL_SCENES, MODEL, REFRESHED, GOAL, PROGRESS, JUDGE, *_ = get_args(Training)
 LABELS = {
     SFT: "SFT", ONE_SCENE: "RL in the simulator, its scene", ALL_SCENES: "RL in the simulator, all training scenes",
     MODEL: "RL in the world model", REFRESHED: "the same, refreshed by the clone's episodes",
     GOAL: "the same, goal distance pays too", PROGRESS: "the same, golden progress pays too",
+    JUDGE: "the same, the reward agent pays instead",
     "embedding": "the same, an embedding head pays", "proxy": "the same, a proxy network pays",
 }
 DENSE = {GOAL: "delta", PROGRESS: "progress"}
 """The dense reward that pays beside the done signal, a value of reward.mode."""
 LEARNED: dict[str, Learned] = {"embedding": EMBEDDING, "proxy": PROXY}
-IN_MODEL = {MODEL, REFRESHED, *DENSE, *LEARNED}
+IN_MODEL = {MODEL, REFRESHED, JUDGE, *DENSE, *LEARNED}
 TABLE_2: tuple[Training, ...] = ("sft", "one_scene", "world_model")
 TABLE_1: tuple[Training, ...] = ("sft", "one_scene", "all_scenes", "world_model", "goal")
 FIGURE_4: tuple[Training, ...] = ("one_scene", "world_model", "embedding", "proxy")
-FIGURE_2: tuple[Training, ...] = ("world_model", "goal", "progress", "embedding", "proxy")
+FIGURE_2: tuple[Training, ...] = ("world_model", "goal", "progress", "judge", "embedding", "proxy")
 OOD, TRAIN = ("ood_object", "ood_combo"), "train"
 PAPER = {
     (SFT, "IND"): (12.0, 84.5, 57.7, 35.8), (SFT, "OOD"): (3.5, 13.3, 10.2, 10.6),
@@ -92,8 +93,8 @@ class RoboScape(Configured):
     trainings: tuple[Training, ...] = ()
     """Rows instead: the clone, and RL from it in the simulator on its scene, there on all training scenes, or in the
     model, as it is or refreshed by simulator episodes of the clone. There the done signal pays; that and the distance
-    to the imagined goal or progress along the golden trajectory; or a reward that was learned from success, as
-    iVideoGPT's head or DiWA's network."""
+    to the imagined goal or progress along the golden trajectory; or instead the reward agent's verdict, or a reward
+    that was learned from success, as iVideoGPT's head or DiWA's network."""
     learned_from: Count = 200
     """Simulator episodes in training scenes that a learned reward has seen."""
     work: Path = Path("runs/roboscape")
@@ -190,7 +191,11 @@ def _cell(
     if training != SFT:
         words = f"{config.task}, seed {config.seed}, {LABELS[training]}"
         with tqdm(total=config.ppo.updates, desc=words, unit="update") as bar:
-            for success_rate in train_on(workplace, policy, imagined, own if training == ONE_SCENE else TRAIN):
+            updates = (
+                train_by_verdicts(workplace, policy, imagined) if imagined and training == JUDGE
+                else train_on(workplace, policy, imagined, own if training == ONE_SCENE else TRAIN)
+            )
+            for success_rate in updates:
                 course.append(success_rate)
                 bar.update()
     settings = sha256(config.model_dump_json().encode()).hexdigest()
