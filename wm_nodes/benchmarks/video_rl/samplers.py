@@ -24,7 +24,10 @@ clips of few steps, only the weights that carry the condition, no KL."""
 
 QUIET_ETA = 0.173
 """CPS spends as much noise by it as DynDiff by 0.6 in the paper's settings."""
-PAPER_RATES = {"DynDiff 0.6": 3e-4, "CPS 0.6": 1e-4, f"CPS {QUIET_ETA}": 3e-4}
+PAPER_RATES = {
+    "DynDiff 0.6": 3e-4, "CPS 0.6": 1e-4, f"CPS {QUIET_ETA}": 3e-4, "Flow-GRPO 0.7": 1e-4, "DanceGRPO 0.3": 1e-3,
+    "SAGE 0.5": 3e-4,
+}
 """Learning rate in the paper's settings: of a half-decade grid from 3e-5 to 3e-3 the one with the highest reward of the
 last three of six buffers, 4 first frames each, of a pilot seed. Other samplers were not tried and take OTHER_RATE."""
 OTHER_RATE = 1e-4
