@@ -44,10 +44,10 @@ def test_positions_alone_need_no_projection() -> None:
     assert policy.act(IMAGES, STATES).actions.shape == (5, 3)
 
 
-def gaussians(*means_and_stds: tuple[float, float]) -> DiagonalGaussian:
+def gaussians(*means_and_stds: tuple[float, float], two_valued: bool = False) -> DiagonalGaussian:
     """One sample whose dimensions have these means and standard deviations."""
     means, stds = torch.tensor(means_and_stds).unbind(-1)
-    return DiagonalGaussian(means.unsqueeze(0), stds.log())
+    return DiagonalGaussian(means.unsqueeze(0), stds.log(), torch.full(means.shape, two_valued))
 
 
 def test_the_likelihood_is_the_density_inside_and_the_mass_of_the_tail_at_a_limit() -> None:
@@ -74,11 +74,12 @@ def test_far_from_the_limits_closed_forms_are_those_of_torch_distributions() -> 
 LIMITED = [((0.0, 0.5), (0.3, 0.4)), ((0.9, 0.4), (1.1, 0.3)), ((-1.3, 0.2), (-0.8, 0.3)), ((0.2, 2.0), (0.0, 1.5))]
 
 
+@pytest.mark.parametrize("two_valued", [False, True])
 @pytest.mark.parametrize(("first", "second"), LIMITED)
 def test_entropy_and_kl_at_the_limits_are_the_means_over_executed_actions(
-    first: tuple[float, float], second: tuple[float, float]
+    first: tuple[float, float], second: tuple[float, float], two_valued: bool
 ) -> None:
-    ours, other = gaussians(first), gaussians(second)
+    ours, other = (gaussians(one, two_valued=two_valued) for one in (first, second))
     actions = ours.executed(torch.randn(400_000, 1, generator=torch.Generator().manual_seed(0)))
     assert ((actions.abs() == 1).float().mean() > 0.01).item()
     logprobs, others = (g.logprob(actions) for g in (ours, other))
@@ -89,14 +90,15 @@ def test_entropy_and_kl_at_the_limits_are_the_means_over_executed_actions(
 
 @pytest.mark.parametrize("mean", [0.0, 0.9, 1.2, -0.95, 2.0])
 @pytest.mark.parametrize("std", [0.05, 0.4])
-def test_the_score_of_executed_actions_has_mean_zero(mean: float, std: float) -> None:
+@pytest.mark.parametrize("two_valued", [False, True])
+def test_the_score_of_executed_actions_has_mean_zero(mean: float, std: float, two_valued: bool) -> None:
     """Else a constant advantage moves the policy: outwards where it fails, without bound."""
     means = torch.full((200_000, 1), mean, dtype=torch.float64, requires_grad=True)
     log_std = torch.tensor([math.log(std)], dtype=torch.float64, requires_grad=True)
-    gaussian = DiagonalGaussian(means, log_std)
+    gaussian = DiagonalGaussian(means, log_std, torch.tensor([two_valued]))
     noise = torch.randn(means.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     score, spread = torch.autograd.grad(gaussian.logprob(gaussian.executed(noise).detach()).sum(), [means, log_std])
-    assert abs(score.mean()) < 5 * score.std() / len(score) ** 0.5 + 1e-9
+    assert abs(score.mean()) < 5 * score.std() / len(score) ** 0.5 + 1e-5  # draws too rare to occur
     assert abs(spread / len(score)) < 0.02
 
 
@@ -112,6 +114,18 @@ def test_executed_action_is_the_clamped_sample() -> None:
     gaussian = DiagonalGaussian(torch.tensor([[0.5, -3.0]]), torch.tensor([0.0, 0.0]))
     assert_close(gaussian.executed(torch.tensor([[2.0, 0.0]])), torch.tensor([[1.0, -1.0]]))
     assert_close(gaussian.executed(None), torch.tensor([[0.5, -1.0]]))
+
+
+def test_a_two_valued_action_is_executed_by_its_sign_and_its_likelihoods_sum_to_one() -> None:
+    gaussian = DiagonalGaussian(torch.tensor([[0.3, 0.3]]), torch.tensor([-1.0, -1.0]), torch.tensor([False, True]))
+    assert_close(gaussian.executed(None), torch.tensor([[0.3, 1.0]]))
+    assert_close(gaussian.executed(torch.tensor([[0.0, -2.0]])), torch.tensor([[0.3, -1.0]]))
+    both = torch.tensor([[-1.0], [1.0]])
+    assert_close(gaussians((0.3, 0.4), two_valued=True).logprob(both).exp().sum(), torch.tensor(1.0))
+    policy = ImagePolicy(encoder(), 3, 3, load_config("base").policy, two_valued=[1])
+    for one in (policy, policy.clone()):
+        actions = one.act(IMAGES, STATES, noise=np.zeros((5, 3), np.float32)).actions
+        assert (np.abs(actions[:, 1]) == 1).all() and (np.abs(actions[:, [0, 2]]) < 1).all()
 
 
 def test_acting_stores_the_likelihood_of_the_executed_action() -> None:

@@ -18,6 +18,7 @@ from wm_nodes.core.tool_control import CommandedMove
 from wm_nodes.core.types import Episode
 from wm_nodes.environments.batch import EnvironmentBatch
 from wm_nodes.policy_rl.factories import make_imagined_environment, make_policy
+from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.policy_rl.pretraining import model_from_data, read_recordings
 from wm_nodes.recording import EpisodeBagWriter
@@ -182,3 +183,16 @@ def test_the_device_program_moves_a_mixed_state_as_the_imagined_environment_does
             device.step(torch.from_numpy(actions))
             np.testing.assert_allclose(device.states_NP.numpy(), states, atol=1e-6)
     assert (states[:, 3] != 1).all() and (states[:, :3] != 0.5).any()
+
+
+def test_two_valued_actions_are_named_as_in_the_recording(config: RunConfig, tmp_path: Path) -> None:
+    folder = model_of(record(tmp_path / "bag", **NO_STATE), config, tmp_path)
+    shown = make_imagined_environment(config, folder, folder / STARTS, num_envs=2, seed=0).reset()
+    last = read_world_manifest(folder)["spec"]["action_names"][-1]
+
+    def policy(name: str) -> ImagePolicy:
+        return make_policy(config.with_values(policy=config.policy.with_values(two_valued_actions=(name,))), folder)
+
+    assert (np.abs(policy(last).act(shown.image, shown.state).actions[:, -1]) == 1).all()
+    with pytest.raises(ValueError, match=rf"two_valued_actions names grip; the actions are .*{last}"):
+        policy("grip")

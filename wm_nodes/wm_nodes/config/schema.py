@@ -228,6 +228,9 @@ class PolicyConfig(SettingsSection):
     probe reads off them, as they are, which are privileged where it learned them from a simulator; or both."""
     dropout: Annotated[float, Field(ge=0, lt=1)]
     """Share of the projected latents that cloning hides from the actor in each gradient step."""
+    two_valued_actions: tuple[str, ...] = ()
+    """Names of actions that are executed as -1 or 1, by their sign, e.g. [gripper]: else a clone that is unsure between
+    open and closed commands a half-open gripper."""
     position_center_m: tuple[float, float, float] = (0.6, 0.0, 0.15)
     """Commanded positions (x, y, z) are shifted by it before the networks see them."""
     position_scale_m: PositiveFloat = 0.2

@@ -99,7 +99,7 @@ def make_policy(config: RunConfig, model_dir: Path | None) -> ImagePolicy:
     measured states are shifted and scaled by what was recorded.
 
     Raises:
-        ValueError: neither a factory nor a checkpoint nor a model.
+        ValueError: neither a factory nor a checkpoint nor a model; a two-valued action that the spec has not.
     """
     if config.policy.factory:
         made: ImagePolicy = load_factory(config.policy.factory)(config)
@@ -117,8 +117,12 @@ def make_policy(config: RunConfig, model_dir: Path | None) -> ImagePolicy:
     if spec.measured:
         recorded = models_of(Path(model_dir), config.device).action.condition
         state_range = recorded.state_mean.tolist(), recorded.state_scale.tolist()
+    if unknown := set(config.policy.two_valued_actions) - set(spec.action_names):
+        raise ValueError(f"policy.two_valued_actions names {', '.join(sorted(unknown))}; the actions are "
+                         f"{', '.join(spec.action_names)}")
     policy = ImagePolicy(
-        encoder, spec.state_dim, spec.action_dim, config.policy, seed=config.seed, state_range=state_range
+        encoder, spec.state_dim, spec.action_dim, config.policy, seed=config.seed, state_range=state_range,
+        two_valued=[spec.action_names.index(name) for name in config.policy.two_valued_actions],
     )
     return policy.to(compute_device(config.device))
 

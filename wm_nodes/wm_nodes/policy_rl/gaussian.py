@@ -2,7 +2,8 @@
 
 Actions are executed inside [-1, 1]. What is drawn beyond a limit is executed at the limit, where the likelihood is the
 mass of the Gaussian's tail beyond it; inside it is the Gaussian's density. So the score of the executed action has mean
-0, as the policy gradient needs, and only the executed action has to be stored.
+0, as the policy gradient needs, and only the executed action has to be stored. Of a two-valued action, both limits are
+at 0: all that is drawn below is executed as -1, the rest as 1.
 """
 
 import math
@@ -21,22 +22,27 @@ _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 @dataclass(frozen=True)
 class DiagonalGaussian:
     """mean_BA: (B, A), of the Gaussian, not of the executed actions. log_std_A: (A,), the same for every sample. Both
-    in normalised action units."""
+    in normalised action units. two_valued_A: bool (A,); None: no action is."""
 
     mean_BA: Tensor
     log_std_A: Tensor
+    two_valued_A: Tensor | None = None
 
     def executed(self, noise_BA: Tensor | None) -> Tensor:
-        """Return the action to execute, (B, A) in [-1, 1]: clamp(mean + std noise), or clamp(mean) without noise."""
+        """Return the action to execute, (B, A) in [-1, 1]: clamp(mean + std noise), or clamp(mean) without noise; of
+        two-valued ones, -1 or 1."""
         actions_BA = self.mean_BA if noise_BA is None else self.mean_BA + self.log_std_A.exp() * noise_BA
-        return actions_BA.clamp(-LIMIT, LIMIT)
+        inside_BA = actions_BA.clamp(-LIMIT, LIMIT)
+        if self.two_valued_A is None:
+            return inside_BA
+        return torch.where(self.two_valued_A, 2.0 * (actions_BA >= 0) - 1.0, inside_BA)
 
     def logprob(self, actions_BA: Tensor) -> Tensor:
         """Return the log likelihood of executed actions summed over A, nats, (B,): log N(action; mean, std^2) inside
         the limits, log Phi(-(1 -+ mean) / std) at them."""
         scaled_BA = (actions_BA - self.mean_BA) * torch.exp(-self.log_std_A)
         density_BA = -0.5 * scaled_BA.square() - self.log_std_A - _LOG_SQRT_2PI
-        tail_BA = log_ndtr((actions_BA * self.mean_BA - LIMIT) * torch.exp(-self.log_std_A))  # at a limit, +-1
+        tail_BA = log_ndtr((actions_BA * self.mean_BA - self._limit_A) * torch.exp(-self.log_std_A))  # where it is +-1
         return torch.where(actions_BA.abs() >= LIMIT, tail_BA, density_BA).sum(-1)
 
     def entropy(self) -> Tensor:
@@ -50,10 +56,10 @@ class DiagonalGaussian:
     def _expected(self, other: "DiagonalGaussian") -> Tensor:
         """E[log likelihood under `other`] of this policy's executed actions, (B,).
 
-        With z = (x - m) / s between a = (-1 - m) / s and b = (1 - m) / s: mass Z = Phi(b) - Phi(a), E[z] = phi(a) -
-        phi(b), E[z^2] = Z + a phi(a) - b phi(b).
+        With z = (x - m) / s between a = (-limit - m) / s and b = (limit - m) / s: mass Z = Phi(b) - Phi(a), E[z] =
+        phi(a) - phi(b), E[z^2] = Z + a phi(a) - b phi(b).
         """
-        low_BA, high_BA = ((limit - self.mean_BA) * torch.exp(-self.log_std_A) for limit in (-LIMIT, LIMIT))
+        low_BA, high_BA = ((sign * self._limit_A - self.mean_BA) * torch.exp(-self.log_std_A) for sign in (-1, 1))
         phi_low_BA, phi_high_BA = (torch.exp(-0.5 * z.square() - _LOG_SQRT_2PI) for z in (low_BA, high_BA))
         below_BA, above_BA = self._log_below_BA.exp(), self._log_above_BA.exp()
         inside_BA = (1 - below_BA - above_BA).clamp(min=0)
@@ -66,9 +72,14 @@ class DiagonalGaussian:
         return (tails_BA - inside_BA * (other.log_std_A + _LOG_SQRT_2PI) - 0.5 * squares_BA).sum(-1)
 
     @property
+    def _limit_A(self) -> Tensor | float:
+        """Beyond it an action is executed at its limit."""
+        return LIMIT if self.two_valued_A is None else LIMIT * ~self.two_valued_A
+
+    @property
     def _log_below_BA(self) -> Tensor:
-        return cast(Tensor, log_ndtr((-LIMIT - self.mean_BA) * torch.exp(-self.log_std_A)))
+        return cast(Tensor, log_ndtr((-self._limit_A - self.mean_BA) * torch.exp(-self.log_std_A)))
 
     @property
     def _log_above_BA(self) -> Tensor:
-        return cast(Tensor, log_ndtr((self.mean_BA - LIMIT) * torch.exp(-self.log_std_A)))
+        return cast(Tensor, log_ndtr((self.mean_BA - self._limit_A) * torch.exp(-self.log_std_A)))

@@ -83,6 +83,7 @@ class ImagePolicy(nn.Module):
         config: sizes and the initial log standard deviation.
         seed: of the initial weights (stream `policy_init`).
         state_range: shift and scale of each value of the state (S,); None: it is taken as it is.
+        two_valued: which of the actions are -1 or 1.
     """
 
     actor: nn.Module
@@ -90,17 +91,20 @@ class ImagePolicy(nn.Module):
 
     def __init__(
         self, encoder: ImageEncoder, state_dim: int, action_dim: int, config: PolicyConfig, *, seed: int = 0,
-        state_range: tuple[Sequence[float], Sequence[float]] | None = None,
+        state_range: tuple[Sequence[float], Sequence[float]] | None = None, two_valued: Sequence[int] = (),
     ) -> None:
         super().__init__()
         self.encoder = encoder
-        self.state_dim, self.action_dim, self.config = state_dim, action_dim, config
+        self.state_dim, self.action_dim, self.config, self.two_valued = state_dim, action_dim, config, two_valued
         center, scale = state_range or ((0.0,) * state_dim, (1.0,) * state_dim)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(stream_seed(seed, "policy_init"))
             self.actor = _Network(encoder, state_dim, action_dim, config, output_gain=0.01)
             self.critic = _Network(encoder, state_dim, 1, config, output_gain=1.0)
         self.log_std_A = nn.Parameter(torch.full((action_dim,), config.init_log_std))
+        self.two_valued_A: Tensor | None
+        flags = torch.tensor([action in two_valued for action in range(action_dim)])
+        self.register_buffer("two_valued_A", flags if two_valued else None, persistent=False)
         self.register_buffer("feature_shift_F", torch.zeros(encoder.feature_dim))
         self.register_buffer("feature_scale_F", torch.ones(encoder.feature_dim))
         self.register_buffer("state_shift_S", torch.tensor(center, dtype=torch.float32))
@@ -112,7 +116,8 @@ class ImagePolicy(nn.Module):
 
     def clone(self) -> "ImagePolicy":
         """Return a copy with its own weights and the same encoder, without gradients: a reference policy."""
-        copy = ImagePolicy(self.encoder, self.state_dim, self.action_dim, self.config).to(self.device)
+        copy = ImagePolicy(self.encoder, self.state_dim, self.action_dim, self.config, two_valued=self.two_valued)
+        copy.to(self.device)
         copy.load_state_dict(self.state_dict())
         return copy.requires_grad_(False)
 
@@ -144,7 +149,8 @@ class ImagePolicy(nn.Module):
 
     def distribution(self, features_BF: Tensor, states_BS: Tensor) -> DiagonalGaussian:
         """Return the action distribution; the mean is not squashed."""
-        return DiagonalGaussian(self.actor(*self._normalise(features_BF, states_BS)), self.log_std_A)
+        mean_BA = self.actor(*self._normalise(features_BF, states_BS))
+        return DiagonalGaussian(mean_BA, self.log_std_A, self.two_valued_A)
 
     def cloning_error(self, features_BF: Tensor, states_BS: Tensor, actions_BA: Tensor) -> Tensor:
         """What behaviour cloning makes small (RS-11): the mean squared error of the mean."""
