@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from safetensors.torch import save_file
+from video_toys import small_codec
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
@@ -13,7 +14,6 @@ from wm_nodes.config.tasks import model_tasks
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
-from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.folder import save_video_folder
 from wm_nodes.video_model.success_reader import SuccessReader, save_success_reader
 from wm_nodes.world_model import Tokenizer, save_model_folder
@@ -43,6 +43,7 @@ def spec_of(config: RunConfig, tokenizer: Tokenizer) -> EnvironmentSpec:
 
 def make_stepped_folder(folder: Path, task: str = "push_cube", **clip: int) -> Path:
     """A video model that goes on from its own frames, of pictures of 64 x 128, and its success reader, untrained."""
+    codec = small_codec(16, 64, 128)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         network = VideoNetwork(NetworkSettings(6, 3, text_dim=4, width=16, depth=2, patch=1, change_std=0.5))
@@ -50,14 +51,14 @@ def make_stepped_folder(folder: Path, task: str = "push_cube", **clip: int) -> P
             if not parameter.any():
                 torch.nn.init.normal_(parameter, std=0.1)
         reader = SuccessReader(64, 128)
-        frames = PatchCodec(16, 6).decode(torch.randn(64, 6, 1, 4, 8)).squeeze(1).permute(0, 3, 1, 2) / 255
+        frames = codec.decode(torch.randn(64, 6, 1, 4, 8)).squeeze(1).permute(0, 3, 1, 2) / 255
     with torch.no_grad():  # so that some frames are read as success
         logits = reader(frames)
         last = reader.layers[-1]
         last.weight *= 4 / logits.std()
         last.bias.copy_(last.bias * 4 / logits.std() - 4 * logits.mean() / logits.std())
     cut = {"stride": 1, "num_conditioning": 1, "given_frames": 4, "new_frames": 2, **clip}
-    save_video_folder(folder, PatchCodec(16, 6), network, cut, {"task": task})
+    save_video_folder(folder, codec, network, cut, {"task": task})
     return save_success_reader(folder, reader, task, {})
 
 

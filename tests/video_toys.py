@@ -11,8 +11,9 @@ import torch.distributed as dist
 from recording_samples import make_spec
 from torch import Tensor, nn
 from torch.distributions import Normal
+from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
-from wm_nodes.config.load import load_video_config
+from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import AdvantageConfig, GrpoConfig, KlConfig, MaskConfig, RolloutConfig, SamplerConfig
 from wm_nodes.core.types import FloatArray
@@ -29,6 +30,7 @@ from wm_nodes.video_model import (
     sample_videos,
 )
 from wm_nodes.video_model.clips import Clips
+from wm_nodes.video_model.tokenizer_codec import TokenizerCodec
 from wm_nodes.video_rl.grpo import GrpoLearner
 
 ACTION_DIM = 2
@@ -67,6 +69,29 @@ def toy_clips(
     E, F = frames.shape[:2]
     states, spec = np.zeros((E, F, 3), np.float32), make_spec()
     return Clips(frames, actions, truth, instructions or ("push",) * E, "push_cube", tuple(range(E)), states, spec)
+
+
+def small_codec(patch: int = 4, height: int = 16, width: int = 32) -> TokenizerCodec:
+    """An untrained tokenizer of 6 values per patch; its weights are the same in every process."""
+    small = {"patch_px": patch, "latent_dim": 6, "width": 16, "depth": 1}
+    config = load_config("smoke", {f"tokenizer.{name}": value for name, value in small.items()}).tokenizer
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return TokenizerCodec(config, height, width).eval()
+
+
+class PixelCodec:
+    """A codec that loses nothing: each latent is a value of a pixel, from -1 to 1, those of 4 x 4 pixels in a cell."""
+
+    patch, channels = 4, 48
+
+    def encode(self, frames: Tensor) -> Tensor:
+        pixels = frames.permute(0, 1, 4, 2, 3).float() / 127.5 - 1
+        return pixel_unshuffle(pixels, self.patch).transpose(1, 2).contiguous()
+
+    def decode(self, latents: Tensor) -> Tensor:
+        pixels = pixel_shuffle(latents.transpose(1, 2), self.patch) * 127.5 + 127.5
+        return pixels.round().clamp(0, 255).to(torch.uint8).permute(0, 1, 3, 4, 2)
 
 
 class Analytic(nn.Module):

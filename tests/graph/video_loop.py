@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from graph.harness import Graph, Probe, wait_until
 from recording_samples import make_episode, make_spec
+from video_toys import small_codec
 
 from wm_msgs.action import TrainVideo
 from wm_nodes.config.load import dump_config, load_video_config
@@ -19,7 +20,6 @@ from wm_nodes.recording import EpisodeBagWriter
 from wm_nodes.training.weights import load_weights, pack_weights
 from wm_nodes.video_model import NetworkSettings, RolloutBuffer, VideoNetwork
 from wm_nodes.video_model.clips import Clips, load_clips
-from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.reference_reward import load_probe
@@ -60,9 +60,9 @@ def write_contexts(path: Path) -> Path:
 
 
 def make_video_folder(folder: Path, clips: Clips, config: VideoRlConfig | None = None) -> Path:
-    """A fitted codec and a network that was not trained; the zeros that it starts with are replaced."""
-    codec = PatchCodec(4, 6)
-    codec.fit(clips.frames.flatten(0, 1))
+    """A codec and a network that were not trained; the zeros that the network starts with are replaced."""
+    codec = small_codec(4, 64, 128)
+    codec.tokenizer.background.fill_(0.75)  # too bright: what makes pictures worse is one direction, soon learned
     generator = torch.Generator().manual_seed(0)
     network = VideoNetwork(NetworkSettings(6, clips.actions.shape[2], text_dim=4, width=16, depth=1))
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Clips, codec, scores, settings and folder of the video model."""
+"""Clips, scores, settings and folder of the video model."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,7 +9,7 @@ import pytest
 import torch
 from recording_samples import make_episode, make_spec
 from torch import Tensor
-from video_toys import toy_clips
+from video_toys import small_codec, toy_clips
 
 from wm_nodes.config.load import VIDEO, ConfigError, dump_config, load_video_config, preset_names, reward_overrides
 from wm_nodes.core.model_folder import ModelFolderError
@@ -19,47 +19,12 @@ from wm_nodes.recording import EpisodeBagWriter, read_episodes
 from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
 from wm_nodes.video_model.clips import Clips, load_clips
-from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.conditions import hashed_words
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
 from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, mix_rewards, score_clips, score_pictures
 from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
 from wm_nodes.world_model.positions import position_names
 from wm_nodes.world_model.tokenizer import NUM_POSITIONS
-
-
-def pictures(count: int, height: int = 8, width: int = 12) -> Tensor:
-    generator = torch_stream(0, "test_pictures")
-    return torch.randint(0, 256, (count, height, width, 3), generator=generator, dtype=torch.uint8)
-
-
-def test_a_codec_with_every_component_gives_each_pixel_back() -> None:
-    codec = PatchCodec(4, 48)
-    assert codec.fit(pictures(40)) == pytest.approx(1.0)
-    clip = pictures(6, 16, 20).view(2, 3, 16, 20, 3)
-    latents = codec.encode(clip)
-    assert latents.shape == (2, 48, 3, 4, 5)
-    assert torch.equal(codec.decode(latents), clip)
-
-
-def test_latents_are_whitened_half_way_and_fewer_components_lose_only_what_they_say() -> None:
-    frames = (pictures(60).float() * torch.linspace(0.1, 1, 12).view(1, 1, 12, 1)).to(torch.uint8)
-    codec = PatchCodec(4, 16)
-    kept = codec.fit(frames)
-    latents = codec.encode(frames[:, None])
-    deviations = latents.square().mean((0, 2, 3, 4)).sqrt() * codec.scale
-    assert torch.allclose(latents.square().mean((0, 2, 3, 4)), deviations / deviations.mean(), rtol=1e-3)
-    pixels = frames.float() / 255
-    patches = pixels.view(60, 2, 4, 3, 4, 3).permute(0, 1, 3, 2, 4, 5).reshape(-1, 48)
-    lost = (codec.decode(latents)[:, 0].float() / 255 - pixels).square().sum()
-    lost = lost / (patches - patches.mean(0)).square().sum()
-    assert float(lost) == pytest.approx(1 - kept, abs=0.01)
-
-
-@pytest.mark.parametrize("wrong", [pictures(2, 9, 12)[None], pictures(2)[None].float()])
-def test_frames_that_the_patch_does_not_divide_or_are_not_uint8_are_refused(wrong: Tensor) -> None:
-    with pytest.raises(ValueError, match="frames must be uint8"):
-        PatchCodec(4, 8).encode(wrong)
 
 
 def test_equal_words_have_equal_vectors_and_case_does_not_matter() -> None:
@@ -142,8 +107,8 @@ def test_closeness_is_the_mean_of_psnr_ssim_and_the_perceptual_score_of_the_gene
 
 
 def test_a_clip_with_less_noise_is_closer_and_no_picture_leaves_the_bounds() -> None:
-    codec, clean = PatchCodec(4, 6), pictures(1, 16, 16)[None].expand(5, 3, 16, 16, 3).clone()
-    codec.fit(pictures(40))
+    picture = torch.randint(0, 256, (16, 16, 3), generator=torch_stream(0, "test_pictures"), dtype=torch.uint8)
+    codec, clean = small_codec(), picture.expand(5, 3, 16, 16, 3).clone()
     noise = torch.randint(-1, 2, clean.shape, generator=torch_stream(0, "test_noise"))
     shown = (clean.int() + noise * torch.tensor([0, 10, 30, 90, 255]).view(5, 1, 1, 1, 1)).clamp(0, 255)
     found = score_pictures(shown.to(torch.uint8), pictures_of(clean), codec, 1)
@@ -159,9 +124,8 @@ def test_without_simulator_state_pictures_are_scored_and_all_else_is_unknown(tmp
         bag.write(make_episode(spec, 0, 4))
     clips = load_clips([tmp_path / "bag"], 2)
     assert clips.ground_truth.shape == (1, 3, len(GROUND_TRUTH_NAMES)) and np.isnan(clips.ground_truth).all()
-    codec, weights = PatchCodec(4, 6), {"closeness": 0.5, "ssim": 0.5, "tracking": 0.0}
-    codec.fit(clips.frames.flatten(0, 1))
-    folder: Any = SimpleNamespace(codec=codec, clip={"num_conditioning": 1})
+    weights = {"closeness": 0.5, "ssim": 0.5, "tracking": 0.0}
+    folder: Any = SimpleNamespace(codec=small_codec(), clip={"num_conditioning": 1})
 
     def scores(**rewards: float) -> dict[str, Tensor]:
         blind: Any = object()
@@ -285,7 +249,7 @@ def test_the_rewards_that_the_command_line_names_replace_those_of_the_preset() -
 
 def make_folder(folder: Path) -> Path:
     network = VideoNetwork(NetworkSettings(channels=6, action_dim=3, text_dim=4, width=8, depth=1))
-    return save_video_folder(folder, PatchCodec(4, 6), network, {"stride": 2, "num_conditioning": 1}, {"seed": 0})
+    return save_video_folder(folder, small_codec(), network, {"stride": 2, "num_conditioning": 1}, {"seed": 0})
 
 
 def test_a_folder_comes_back_equal_and_a_changed_file_is_refused(tmp_path: Path) -> None:

@@ -5,12 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from video_toys import toy_clips
+from video_toys import small_codec, toy_clips
 
 from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.video_model.clips import Clips
-from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.success_reader import (
     SUCCESS_MANIFEST,
     WEIGHTS,
@@ -33,9 +32,7 @@ def recorded(count: int, seed: int) -> tuple[Clips, np.ndarray]:  # type: ignore
 
 
 def test_a_reader_learns_from_labels_and_comes_back_from_its_folder_as_it_was(tmp_path: Path) -> None:
-    clips, _ = recorded(60, 0)
-    codec = PatchCodec(4, 8)
-    codec.fit(clips.frames.flatten(0, 1))
+    (clips, _), codec = recorded(60, 0), small_codec()
     reader = train_success_reader(clips, codec, 40, seed=0)
     unseen, done = recorded(30, 1)
     scores = score_reader(reader, unseen.frames, done)
@@ -61,4 +58,4 @@ def test_a_reader_learns_from_labels_and_comes_back_from_its_folder_as_it_was(tm
 def test_too_few_episodes_are_refused() -> None:
     clips, _ = recorded(4, 0)
     with pytest.raises(ValueError, match=r"4 episodes.*record more"):
-        train_success_reader(clips, PatchCodec(4, 8), 1, seed=0)
+        train_success_reader(clips, small_codec(), 1, seed=0)

@@ -1,5 +1,6 @@
 """A world model's tokenizer as the codec of a video model."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -74,6 +75,18 @@ def test_beside_its_world_model_the_folder_needs_no_codec_of_its_own(world_model
         load_video_folder(tmp_path / "alone")
 
 
+def test_a_folder_of_the_codec_that_is_gone_is_refused_by_name(world_model: Path, tmp_path: Path) -> None:
+    codec = codec_of_world_model(world_model)
+    folder = save_video_folder(
+        tmp_path / "old", codec, VideoNetwork(NetworkSettings(codec.channels, 3, width=8, depth=1)), {"stride": 2}, {}
+    )
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["codec"] = {"kind": "patch", "patch": 4, "channels": 6}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(ModelFolderError, match=r"old has a codec of kind patch, .* reads tokenizer; train it anew"):
+        load_video_folder(folder)
+
+
 def test_the_shipped_video_model_serves_the_recommended_settings_and_no_others() -> None:
     shipped = shipped_video_model(load_video_config("recommended"))
     assert shipped is not None and isinstance(shipped.codec, TokenizerCodec)
@@ -108,5 +121,5 @@ def test_an_indivisible_picture_wrong_channels_and_discrete_tokens_are_refused(w
     with pytest.raises(ValueError, match="this codec has"):
         codec.decode(torch.zeros(1, codec.channels + 1, 3, *codec.tokenizer.grid))
     discrete = load_config("smoke", {"tokenizer.kind": "lfq"}).tokenizer
-    with pytest.raises(ValueError, match="continuous tokens, not lfq"):
+    with pytest.raises(ValueError, match=r"world model of tokenizer\.kind continuous, not lfq"):
         TokenizerCodec(discrete, 64, 128)

@@ -7,14 +7,13 @@ import pytest
 import torch
 from recording_samples import make_spec
 from torch import Tensor
-from video_toys import rollout_config
+from video_toys import rollout_config, small_codec
 
 from wm_nodes.config.load import load_config
 from wm_nodes.core.seeding import stream_seed
 from wm_nodes.core.specs import SOURCE_IMAGINED, EnvironmentSpec
 from wm_nodes.core.types import FloatArray, StepResult, UInt8Array
 from wm_nodes.video_model import NetworkSettings, VideoNetwork, initial_noise
-from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.conditions import Condition, hashed_words
 from wm_nodes.video_model.continuation import ClipLengths, continue_videos
 from wm_nodes.video_model.folder import VideoFolder
@@ -40,12 +39,12 @@ def starts() -> tuple[UInt8Array, FloatArray]:
 def make_folder(**clip: int) -> VideoFolder:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        codec = PatchCodec(4, 6)
         network = VideoNetwork(NetworkSettings(6, 3, text_dim=4, width=16, depth=2, patch=1, change_std=0.5))
         for parameter in network.parameters():  # what starts at zero makes the network say nothing
             if not parameter.any():
                 torch.nn.init.normal_(parameter, std=0.1)
-    return VideoFolder(codec, network.eval(), {**CLIP, **clip}, {"sha256": {"network": "0"}, "task": "push_cube"})
+    codec, manifest = small_codec(4, HEIGHT, WIDTH), {"sha256": {"network": "0"}, "task": "push_cube"}
+    return VideoFolder(codec, network.eval(), {**CLIP, **clip}, manifest)
 
 
 class Reader:

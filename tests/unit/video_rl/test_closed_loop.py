@@ -1,18 +1,18 @@
 """Continuations of a video model's own frames: what a group shares, what it is scored against, and its head-room."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from video_toys import ACTION_DIM, randn, tiny_network, toy_clips
+from video_toys import ACTION_DIM, PixelCodec, randn, tiny_network, toy_clips
 
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.video_model.clips import Clips
-from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.horizons import Headroom, horizon_scores, measure_headroom
@@ -43,13 +43,11 @@ def recorded(frames: int = FRAMES) -> Clips:
 
 
 def make_folder(given: int = GIVEN, seed: int = 0) -> VideoFolder:
-    torch.manual_seed(0)
-    codec = PatchCodec(4, 6)
-    codec.fit(torch.randint(0, 256, (40, 8, 12, 3), dtype=torch.uint8))
+    codec: Any = PixelCodec()
     clip = {"stride": 1, "num_conditioning": 1, "given_frames": given, "new_frames": NEW} if given else {
         "stride": 1, "num_conditioning": 1
     }
-    network = tiny_network(6)
+    network = tiny_network(codec.channels)
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.add_(0.05 * randn(*parameter.shape, seed=seed))
@@ -64,8 +62,8 @@ def test_a_group_goes_on_from_one_self_made_history_under_the_recorded_actions()
     source = make_source()
     request = GroupRequest((1, 0), 3, 5, 0, history=2)
     buffer = source.sample(request)
-    assert buffer.rollout.latents.shape == (6, 6, GIVEN + NEW, 2, 3)
-    given = buffer.condition.frames.view(2, 3, 6, GIVEN, 2, 3)
+    assert buffer.rollout.latents.shape == (6, 48, GIVEN + NEW, 2, 3)
+    given = buffer.condition.frames.view(2, 3, 48, GIVEN, 2, 3)
     assert torch.equal(given, given[:, :1].expand_as(given)), "not one history for a group"
     assert torch.equal(buffer.rollout.latents[:, :, :GIVEN], buffer.condition.frames)
     assert not torch.equal(buffer.rollout.latents[0], buffer.rollout.latents[1]), "a group of one clip"

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from video_toys import toy_clips
+from video_toys import small_codec, toy_clips
 
 from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.config.seed_ranges import HELDOUT
@@ -16,7 +16,6 @@ from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.environments.record import collect_plan, scripted_plan
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
 from wm_nodes.video_model.clips import Clips, load_clips
-from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
 from wm_nodes.video_model.success_reader import SuccessReader, load_success_reader, reader_of, save_success_reader
 from wm_nodes.video_rl.clip_faults import FaultLimits
@@ -97,9 +96,9 @@ def test_both_models_of_a_run_are_measured_in_the_simulator_and_by_the_other_rea
 
 
 def test_a_model_of_another_codec_has_no_reader_but_its_own(tmp_path: Path) -> None:
-    world, codec = shipped_model("push_cube"), PatchCodec(4, 6)
+    world = shipped_model("push_cube")
     network = VideoNetwork(NetworkSettings(6, 3, 4, 16, 2))
-    save_video_folder(tmp_path, codec, network, {"stride": 2, "num_conditioning": 1}, {})
+    save_video_folder(tmp_path, small_codec(), network, {"stride": 2, "num_conditioning": 1}, {})
     assert reader_of(tmp_path, "push_cube", world) is None
     save_success_reader(tmp_path, SuccessReader(64, 128, 0.25), "push_cube", {})
     own, shared = (reader_of(folder, "push_cube", world) for folder in (tmp_path, world / "video_model"))

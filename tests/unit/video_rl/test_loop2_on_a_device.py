@@ -54,9 +54,8 @@ TOY = {
     "rollout.micro_batch": 4, "grpo.learning_rate": 1e-3, "grpo.logprob_weight": "cps", "grpo.micro_batch": 5,
 }
 SMALL = {
-    **TOY, "model.codec": "patch", "model.channels": 6, "model.width": 16, "model.depth": 2, "model.batch_size": 2,
-    "model.training.num_iterations": 4, "evaluation.contexts": 2, "evaluation.every": 1,
-    "rewards": {"psnr_db": 1.0, "tracking": 1.0},
+    **TOY, "model.width": 16, "model.depth": 2, "model.batch_size": 2, "model.training.num_iterations": 4,
+    "evaluation.contexts": 2, "evaluation.every": 1, "rewards": {"psnr_db": 1.0, "tracking": 1.0},
 }
 """The preset gpu at a size for tests."""
 NFT = {"grpo.objective": "nft", "grpo.kl.anchor": "frozen"}

@@ -37,12 +37,6 @@ class FlowMatchingConfig(SettingsSection):
 class VideoModelConfig(SettingsSection):
     """The embedded video model."""
 
-    codec: Literal["patch", "tokenizer"]
-    """patch: principal components of patches; tokenizer: the frozen tokenizer of the task's shipped world model."""
-    patch: PositiveInt
-    """Codec `patch` only: side of a patch, px."""
-    channels: PositiveInt
-    """Codec `patch` only: how many components are kept."""
     stride: PositiveInt
     """Recorded steps between two frames."""
     num_conditioning: NonNegativeInt

@@ -18,7 +18,7 @@ from wm_nodes.recording import read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.video_model import Condition
 from wm_nodes.video_model.conditions import hashed_words
-from wm_nodes.video_model.tokenizer_codec import Codec
+from wm_nodes.video_model.tokenizer_codec import TokenizerCodec
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Clips:
             ground_truth=self.ground_truth[:, first:last], states=self.states[:, first:last],
         )
 
-    def condition(self, codec: Codec, num_conditioning: int, text_dim: int) -> Condition:
+    def condition(self, codec: TokenizerCodec, num_conditioning: int, text_dim: int) -> Condition:
         """Return the first frames, the actions and the instruction, where the codec is."""
         first = codec.encode(self.frames[:, :num_conditioning])
         return Condition(first, self.actions, hashed_words(self.instructions, text_dim)).to(first.device)

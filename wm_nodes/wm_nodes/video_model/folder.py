@@ -23,9 +23,8 @@ from wm_nodes.core.model_folder import (
 )
 from wm_nodes.training.weights import WeightsError, load_weights, pack_weights
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
-from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.continuation import ClipLengths
-from wm_nodes.video_model.tokenizer_codec import Codec, TokenizerCodec, codec_of_world_model
+from wm_nodes.video_model.tokenizer_codec import TokenizerCodec, codec_of_world_model
 
 CODEC, NETWORK = "codec.safetensors", "network.safetensors"
 FORMAT = 2
@@ -35,7 +34,7 @@ FORMAT = 2
 class VideoFolder:
     """A video model, with what its folder says of it."""
 
-    codec: Codec
+    codec: TokenizerCodec
     """Pictures to latents and back."""
     network: VideoNetwork
     """In evaluation mode."""
@@ -61,7 +60,7 @@ class VideoFolder:
 
 
 def save_video_folder(
-    folder: Path, codec: Codec, network: VideoNetwork, clip: Mapping[str, int], story: Mapping[str, Any]
+    folder: Path, codec: TokenizerCodec, network: VideoNetwork, clip: Mapping[str, int], story: Mapping[str, Any]
 ) -> Path:
     """Write the folder; the manifest, which names the files' sha256, comes last."""
     packed = {CODEC: pack_weights(codec), NETWORK: pack_weights(network)}
@@ -91,15 +90,16 @@ def load_video_folder(folder: Path, device: torch.device | str = "cpu") -> Video
     return VideoFolder(codec.to(device), network.to(device), manifest["clip"], manifest)
 
 
-def _load_codec(folder: Path, sha256: str, kind: str, **settings: Any) -> Codec:
-    if kind == "tokenizer" and not (folder / CODEC).is_file() and (folder.parent / MANIFEST).is_file():
+def _load_codec(folder: Path, sha256: str, kind: str, **settings: Any) -> TokenizerCodec:
+    if kind != "tokenizer":
+        raise ModelFolderError(f"{folder} has a codec of kind {kind}, this version reads tokenizer; train it anew")
+    if not (folder / CODEC).is_file() and (folder.parent / MANIFEST).is_file():
         shared = codec_of_world_model(folder.parent)
         if pack_weights(shared).sha256 != sha256:
             raise ModelFolderError(f"{folder} was made with another tokenizer than {folder.parent}'s; train it anew")
         return shared
-    if kind == "tokenizer":
-        settings["config"] = TokenizerConfig.model_validate(settings["config"])
-    codec: Codec = PatchCodec(**settings) if kind == "patch" else TokenizerCodec(**settings)
+    settings["config"] = TokenizerConfig.model_validate(settings["config"])
+    codec = TokenizerCodec(**settings)
     load_module(folder / CODEC, codec, sha256)
     return codec
 

@@ -22,7 +22,7 @@ from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import CODEC, load_module, read_video_manifest
-from wm_nodes.video_model.tokenizer_codec import Codec
+from wm_nodes.video_model.tokenizer_codec import TokenizerCodec
 from wm_nodes.world_model.position_probe import PictureReader, halving_convolutions
 
 CHANNELS, HIDDEN = (16, 32, 32, 48), 48
@@ -58,7 +58,7 @@ class SuccessReader(PictureReader):
 
 
 def train_success_reader(
-    clips: Clips, codec: Codec, num_iterations: int, seed: int, run_dir: Path | None = None
+    clips: Clips, codec: TokenizerCodec, num_iterations: int, seed: int, run_dir: Path | None = None
 ) -> SuccessReader:
     """Train on recorded frames and, as often, on what the codec makes of them; then choose the threshold.
 

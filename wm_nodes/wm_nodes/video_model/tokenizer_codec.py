@@ -4,14 +4,13 @@ Shapes: B clips, F frames, H W 3 image, C values per token, h w token grid.
 """
 
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from wm_nodes.config.schema import TokenizerConfig
-from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.world_model import Tokenizer, load_model_folder
 
 BATCH = 256
@@ -30,7 +29,7 @@ class TokenizerCodec(nn.Module):
     def __init__(self, config: TokenizerConfig, height: int, width: int) -> None:
         super().__init__()
         if config.kind != "continuous":
-            raise ValueError(f"a video model needs continuous tokens, not {config.kind}; take model.codec patch")
+            raise ValueError(f"a video model needs a world model of tokenizer.kind continuous, not {config.kind}")
         self.config = config
         self.tokenizer = Tokenizer(config, height, width).requires_grad_(False)
         self.channels, self.patch = config.latent_dim, config.patch_px
@@ -89,6 +88,3 @@ def codec_of_world_model(folder: Path) -> TokenizerCodec:
     codec = TokenizerCodec(config, models.tokenizer.height, models.tokenizer.width)
     codec.tokenizer.load_state_dict(models.tokenizer.state_dict())
     return codec.eval()
-
-
-Codec: TypeAlias = PatchCodec | TokenizerCodec

@@ -20,7 +20,7 @@ from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_model.success_reader import SuccessReader
-from wm_nodes.video_model.tokenizer_codec import Codec
+from wm_nodes.video_model.tokenizer_codec import TokenizerCodec
 from wm_nodes.video_rl.clip_faults import FaultLimits, FilmedScene, find_faults, measure_fault_limits
 from wm_nodes.video_rl.execution_reward import fit_tool_correction
 from wm_nodes.video_rl.reference_reward import score_clips
@@ -60,7 +60,8 @@ class Yardstick:
 
 
 def make_yardstick(
-    codec: Codec, recordings: Clips, probe: PositionProbe, reader: SuccessReader | None, simulation: SimulationConfig
+    codec: TokenizerCodec, recordings: Clips, probe: PositionProbe, reader: SuccessReader | None,
+    simulation: SimulationConfig,
 ) -> Yardstick:
     """Measure limits and correction on recordings. Raises ValueError: no camera stands still, or no state is known."""
     scene = filmed_scene(recordings.task, simulation, recordings.frames.shape[2])

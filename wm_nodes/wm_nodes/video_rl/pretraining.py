@@ -1,4 +1,4 @@
-"""From clips to a video model: codec, flow matching, held-out scores. Resumable; what is finished is kept."""
+"""From clips to a video model: flow matching, held-out scores. Resumable; what is finished is kept."""
 
 from datetime import date
 from pathlib import Path
@@ -17,18 +17,15 @@ from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.video_model import Condition, NetworkSettings, VideoNetwork
 from wm_nodes.video_model.clips import Clips
-from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.flow_matching import train_video_model
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder, read_video_manifest, save_video_folder
 from wm_nodes.video_model.success_reader import save_success_reader, score_reader, train_success_reader
-from wm_nodes.video_model.tokenizer_codec import Codec, codec_of_world_model
+from wm_nodes.video_model.tokenizer_codec import codec_of_world_model
 from wm_nodes.video_rl.reference_reward import score_clips
 from wm_nodes.video_rl.validation import load_or_measure_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
-CODEC_FRAMES, READER_ITERATIONS = 2000, 500
-CELLS = {"patch": 2, "tokenizer": 1}
-"""Side of the square of latent cells that the network works on at a time."""
+READER_ITERATIONS = 500
 BEFORE = Path("evaluations") / "before.json"
 
 
@@ -85,13 +82,13 @@ def shipped_video_model(config: VideoRlConfig) -> VideoFolder | None:
 
 
 def _train(config: VideoRlConfig, clips: Clips, run_dir: Path) -> tuple[VideoFolder, dict[str, float]]:
-    """Fit the codec and train the network; return both, on config.device, and the last training losses."""
+    """Train the network on the shipped tokenizer's latents; return both, on config.device, and the last losses."""
     device, settings, K = compute_device(config.device), config.model, config.model.num_conditioning
-    codec = _make_codec(config, clips).to(device)
+    codec = codec_of_world_model(shipped_model(config.task)).to(device)
     latents, condition = codec.encode(clips.frames), clips.condition(codec, K, settings.text_dim)
     sizes = NetworkSettings(
         codec.channels, clips.actions.shape[2], settings.text_dim, settings.width, settings.depth,
-        patch=CELLS[settings.codec], change_std=change_std(latents, K, settings.training.new_frames),
+        patch=1, change_std=change_std(latents, K, settings.training.new_frames),
     )
     torch.manual_seed(stream_seed(config.seed, "video_network") % 2**32)
     network = VideoNetwork(sizes).to(device)
@@ -148,17 +145,6 @@ def _score_baselines(
     coded = folder.codec.decode(folder.codec.encode(contexts.frames))
     scores = {f"copy_{name}": float(v.mean()) for name, v in score_clips(copied, contexts, probe, K).named().items()}
     return scores | {"codec_psnr_db": float(score_clips(coded, contexts, probe, K).psnr_db.mean())}
-
-
-def _make_codec(config: VideoRlConfig, clips: Clips) -> Codec:
-    settings = config.model
-    if settings.codec == "tokenizer":
-        return codec_of_world_model(shipped_model(config.task))
-    codec = PatchCodec(settings.patch, settings.channels)
-    frames = clips.frames.flatten(0, 1)
-    drawn = numpy_stream(config.seed, "codec_frames").choice(len(frames), min(CODEC_FRAMES, len(frames)), replace=False)
-    codec.fit(frames[torch.from_numpy(drawn)])
-    return codec
 
 
 def change_std(latents: Tensor, num_conditioning: int, new_frames: int = 0) -> float:

@@ -19,7 +19,7 @@ from wm_nodes.config.tasks import get_task
 from wm_nodes.core.types import FloatArray
 from wm_nodes.reward.picture_similarity import psnr_db, ssim
 from wm_nodes.video_model.clips import Clips
-from wm_nodes.video_model.tokenizer_codec import Codec
+from wm_nodes.video_model.tokenizer_codec import TokenizerCodec
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.positions import columns_of, probe_targets
@@ -95,7 +95,9 @@ def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_con
     )
 
 
-def score_pictures(frames: Tensor, references: Clips, codec: Codec, num_conditioning: int) -> dict[str, Tensor]:
+def score_pictures(
+    frames: Tensor, references: Clips, codec: TokenizerCodec, num_conditioning: int
+) -> dict[str, Tensor]:
     """Return by name, float64 (N,) in the host's memory, how alike decoded clips, uint8 (N, F, H, W, 3), and their
     recordings look (DD-28a); no simulator state is read.
 
