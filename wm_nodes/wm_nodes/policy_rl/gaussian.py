@@ -21,12 +21,14 @@ _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 
 @dataclass(frozen=True)
 class DiagonalGaussian:
-    """mean_BA: (B, A), of the Gaussian, not of the executed actions. log_std_A: (A,), the same for every sample. Both
-    in normalised action units. two_valued_A: bool (A,); None: no action is."""
+    """See above; in normalised action units."""
 
     mean_BA: Tensor
+    """(B, A), of the Gaussian, not of the executed actions."""
     log_std_A: Tensor
+    """(A,), the same for every sample."""
     two_valued_A: Tensor | None = None
+    """bool (A,); None: no action is."""
 
     def executed(self, noise_BA: Tensor | None) -> Tensor:
         """Return the action to execute, (B, A) in [-1, 1]: clamp(mean + std noise), or clamp(mean) without noise; of
