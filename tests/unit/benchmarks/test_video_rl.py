@@ -17,7 +17,7 @@ from benchmarks.video_rl import cost
 from benchmarks.video_rl.clock import clocked
 from benchmarks.video_rl.comparison import GAINS, compare_samplers, gains, value
 from benchmarks.video_rl.cost import ANCHORS, toy_rollout
-from benchmarks.video_rl.learning import alarms, hacked, train_on_discs
+from benchmarks.video_rl.learning import alarms, hacked, train_on_discs, train_sampler
 from benchmarks.video_rl.samplers import LEARNER, DiscPlan, SamplerSetup, dyndiff, learning_samplers, sampler_setup
 from benchmarks.video_rl.sources import DiscSource, sample_scenes
 from benchmarks.video_rl.spread import group_spread
@@ -25,7 +25,8 @@ from benchmarks.video_rl.tables import gain_table
 from benchmarks.video_rl.trials import ablation_trials, hacking_trials
 from wm_nodes.apps.cli import main
 from wm_nodes.config.shipped import PRETRAINED
-from wm_nodes.video_rl.toy_scene import BASE, draw_scenes, load_base
+from wm_nodes.video_model import RolloutBuffer
+from wm_nodes.video_rl.toy_scene import BASE, SceneRequest, draw_scenes, load_base
 
 SHORT = DiscPlan(iterations=2, contexts=1, eval_contexts=4, eval_every=1)
 
@@ -209,6 +210,17 @@ def test_a_training_keeps_the_spread_of_its_rollouts_and_the_noise_of_steps_that
     alike = replace(buffer.rollout, latents=buffer.rollout.latents[::3].repeat_interleave(3, 0))
     equal = replace(buffer, rollout=alike).with_rewards({"total": rewards})
     assert group_spread(equal, 3)["rollout_diversity"] == pytest.approx(0, abs=1e-6)
+
+
+def test_a_training_ends_where_every_clip_is_paid_the_same() -> None:
+    class Equal(DiscSource):
+        def score(self, request: SceneRequest, clips: RolloutBuffer) -> RolloutBuffer:
+            return clips.with_rewards({"total": torch.ones(len(clips), dtype=torch.float64)})
+
+    sampler, plan = learning_samplers(LEARNER)[0], replace(SHORT, iterations=9, eval_every=3)
+    found = train_sampler(Equal(load_base(), sampler, plan, 0), sampler, plan, seed=0)
+    assert found["buffers"]["skipped"] == [1, 2, 3, 4]
+    assert [one["iteration"] for one in found["evaluations"]] == [0, 3, 4]
 
 
 def test_a_clock_counts_the_time_inside_the_functions_it_names_and_leaves_them_as_they_were() -> None:

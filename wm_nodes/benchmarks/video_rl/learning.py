@@ -1,6 +1,7 @@
 """Learning: what each sampler makes of the same number of model calls."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
 
@@ -11,7 +12,7 @@ from benchmarks.video_rl.samplers import DiscPlan, LearningPlan, SamplerSetup
 from benchmarks.video_rl.sources import DiscSource, TrainingSource
 from wm_nodes.core.device import device_of
 from wm_nodes.video_model import VideoNetwork
-from wm_nodes.video_rl.grpo import GrpoLearner
+from wm_nodes.video_rl.grpo import GrpoLearner, NothingToLearnError
 from wm_nodes.video_rl.reward_hacking import find_hacked_metrics
 from wm_nodes.video_rl.train import Request, VideoLearner, post_train, sample_buffers
 from wm_nodes.video_rl.training_run import flatten_metrics
@@ -26,7 +27,8 @@ def train_sampler(
     on_iteration: Callable[[], object] = lambda: None, learner: VideoLearner | None = None,
 ) -> dict[str, Any]:
     """Post-train source.network in place; return what that gave: scores of each held-out context before and after,
-    means over them (before, every eval_every buffers, and after), a list per quantity of the buffers, and seconds.
+    means over them (before, every eval_every buffers, and after), a list per quantity of the buffers, and seconds. It
+    ends where nothing is left to learn.
 
     learner: None: a GrpoLearner of the sampler's settings.
     """
@@ -39,12 +41,16 @@ def train_sampler(
         clocked(learner, "train", device=device) as train,
     ):
         training = post_train(learner, sample_buffers(source, learner, plan.iterations))
-        for iteration, (buffer, report) in enumerate(training, 1):
-            buffers.append({**flatten_metrics(report), **source.measure(buffer)})
-            if iteration % plan.eval_every == 0 or iteration == plan.iterations:
-                after = source.validate()
-                evaluations.append({"iteration": iteration, **_means(after)})
-            on_iteration()
+        with suppress(NothingToLearnError):  # e.g. every clip succeeds: it would learn no more
+            for iteration, (buffer, report) in enumerate(training, 1):
+                buffers.append({**flatten_metrics(report), **source.measure(buffer)})
+                if iteration % plan.eval_every == 0:
+                    after = source.validate()
+                    evaluations.append({"iteration": iteration, **_means(after)})
+                on_iteration()
+    if len(buffers) % plan.eval_every:
+        after = source.validate()
+        evaluations.append({"iteration": len(buffers), **_means(after)})
     names = dict.fromkeys(name for row in buffers for name in row)  # a window's steps are not those of every buffer
     return {
         "sampler": sampler.name, "shared_noise": sampler.shared_noise, "seed": seed, "plan": asdict(plan),

@@ -126,15 +126,19 @@ class Outcome(RecordedTrainings[OutcomePlan]):
         probe, fps = load_probe(shipped_model(TASK), self.where), clip_fps(self.context_bags[0], folder.clip["stride"])
         buffers = count(1)
 
-        def keep() -> None:
-            trained = next(buffers)
+        def keep(trained: int) -> None:
             if self.weights and trained in self.measured(trial.plan):
                 path = self.weights / weights_name(trial.sampler.name, seed, trained)
                 write_atomic(path, pack_weights(folder.network).data)
+
+        def after_buffer() -> None:
+            keep(next(buffers))
             on_iteration()
 
         with OutcomeSource(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed, fps) as source:
-            row = train_sampler(source, trial.sampler, trial.plan, seed, keep)
+            row = train_sampler(source, trial.sampler, trial.plan, seed, after_buffer)
+        for left in range(next(buffers), trial.plan.iterations + 1):  # nothing was left to learn
+            keep(left)
         return {name: value for name, value in row.items() if name not in ("before", "after")}
 
     def measured(self, plan: OutcomePlan) -> list[int]:

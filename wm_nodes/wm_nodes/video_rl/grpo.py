@@ -38,6 +38,10 @@ MAX_SKIPPED = 5
 """So many buffers in a row whose rewards differ in no group end a training: nothing can be learned from the reward."""
 
 
+class NothingToLearnError(ValueError):
+    """The clips of a context are paid the same, in MAX_SKIPPED buffers in a row."""
+
+
 @dataclass(frozen=True)
 class UpdateReport:
     """One optimizer step; see docs/metrics.md.
@@ -154,7 +158,8 @@ class GrpoLearner:
         kept = best_of_n(advantages.advantages_N, buffer.group_ids, advantages.kept_N, settings.best_of_n)
         skipped = 0 if bool(kept.any()) else self.skipped + 1
         if dropped == advantages.num_groups or skipped >= MAX_SKIPPED:
-            raise ValueError(
+            kind = ValueError if dropped == advantages.num_groups else NothingToLearnError
+            raise kind(
                 f"nothing to learn from: {invalid} of {len(buffer)} rewards are invalid, {dropped} of "
                 f"{advantages.num_groups} groups have too few valid ones and {advantages.num_zero_std - dropped} no "
                 f"spread; {self.skipped} buffers before it were skipped; look at the reward"
