@@ -178,7 +178,8 @@ def outcome_samplers(preset: str = "outcome") -> list[SamplerSetup]:
 def paper_samplers() -> list[SamplerSetup]:
     """Of Table 5 (preset paper), each on its learner: full likelihood, a clip of 1e-4 at two updates on a buffer, the
     KL of DD-20, 8 of 16 clips, 55 % of 15 steps, initial noise of their own. CPS at DynDiff's eta, by its authors'
-    weight of the likelihood, too, and at the noise that DynDiff spends; Mix-GRPO is Flow-GRPO in a window.
+    weight of the likelihood, too, and at the noise that DynDiff spends. Mix-GRPO is Flow-GRPO in a window of four steps
+    that begins with the first ones; DynDiff in it tells what is the window's.
 
     The numbers of a network call, of storage and the learning rate are of a small model.
     """
@@ -195,7 +196,10 @@ def paper_samplers() -> list[SamplerSetup]:
         for name, sampler in samplers.items()
     ]
     weighted = replace(setups[1], name="CPS 0.6, cps", grpo=setups[1].grpo.with_values(logprob_weight="cps"))
-    return [*setups, weighted, replace(_in_window(setups[3]), name="Mix-GRPO 0.7", shared_noise=False)]
+    windows = {"Mix-GRPO 0.7": setups[3], "DynDiff 0.6, window": setups[0]}
+    return [*setups, weighted, *(
+        replace(_in_window(setup), name=name, shared_noise=False) for name, setup in windows.items()
+    )]
 
 
 def _in_window(sampler: SamplerSetup, size: int = 4, period: int = 7) -> SamplerSetup:
