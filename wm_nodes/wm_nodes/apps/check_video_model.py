@@ -1,4 +1,4 @@
-"""Check a video model before GRPO trains it: ratio, KL, ODE step, mask and buffer, a line each; of an embedded
+"""Check a video model before GRPO trains it: sampled videos, ratio, KL and mask, a line each; of an embedded
 one what the best clip of a group is better by than the others, clip after clip on its own frames: where that closes
 little of the gap to the codec, no group method can learn.
 
