@@ -52,8 +52,7 @@ from wm_nodes.world_model.position_probe import PositionProbe
 MEASURES = ("success_path", "success", "outcome", "scenery")
 SCORES = ("success", "outcome", "scenery")
 METRICS = (
-    "success", "reader_success", "executed_success", "executed_object_cm", "object_permanence", "ghost_motion",
-    "impossible_tool_steps", "scenery_change",
+    "success", "reader_success", "executed_success", "executed_object_cm", "object_permanence", "impossible_tool_steps",
 )
 MEASURED = 100
 

@@ -21,8 +21,7 @@ TITLES = {
 UNREWARDED_TITLES = {
     "executed_success": "executed: task done", "executed_object_cm": "executed: object elsewhere, cm",
     "reader_success": "task done, other reader", "object_permanence": "object still seen (share)",
-    "impossible_tool_steps": "impossible tool steps (share)", "ghost_motion": "object moves untouched (share)",
-    "scenery_change": "scenery change",
+    "impossible_tool_steps": "impossible tool steps (share)",
 }
 """The same of metrics that no reward can weigh."""
 ALL_TITLES = TITLES | UNREWARDED_TITLES

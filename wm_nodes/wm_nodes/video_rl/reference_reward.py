@@ -28,10 +28,8 @@ TRACKING_SCALE_M, OUTCOME_SCALE_M = 0.03, 0.05
 """An error of this much takes the tracking score, or the outcome, to 1 / e."""
 SEEN_MOTION = 12
 """A pixel counts as scenery while no recorded frame differs from the first one by more than this, of 255."""
-ERRORS = (
-    "scenery", "object_cm", "tool_cm", "executed_object_cm", "ghost_motion", "impossible_tool_steps", "scenery_change",
-)
-"""Scores of which less is better; the last four are heldout_metrics.UNREWARDED."""
+ERRORS = ("scenery", "object_cm", "tool_cm", "executed_object_cm", "impossible_tool_steps")
+"""Scores of which less is better; the last two are heldout_metrics.UNREWARDED."""
 PICTURE_SCORES = ("ssim", "perceptual", "closeness")
 """What score_pictures() gives."""
 FULL_PSNR_DB = 40.0
