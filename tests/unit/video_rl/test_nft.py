@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import torch.multiprocessing as mp
 from torch import Tensor
-from torch.testing import assert_close
 from video_toys import (
     SHAPE,
     Analytic,
@@ -21,7 +19,6 @@ from video_toys import (
     toy_buffer,
     toy_rollout_settings,
     train_rounds,
-    video_learner_rank,
     weights,
 )
 
@@ -31,7 +28,6 @@ from wm_nodes.reports.clip_report import clip_panels
 from wm_nodes.reports.curves import curves
 from wm_nodes.training import checkpoint
 from wm_nodes.training.metrics import FILE_NAME, read_metrics
-from wm_nodes.training.ranks import Ranks
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_rl.checks import examine
 from wm_nodes.video_rl.group_advantages import GroupAdvantages
@@ -52,9 +48,10 @@ def nft_config(beta: float = 1.0, *, times: int = 3, **changes: Any) -> GrpoConf
     })
 
 
-def make(network: torch.nn.Module | None = None, *, seed: int = 0, ranks: Ranks | None = None,
-         rollout: Any = ODE, **changes: Any) -> GrpoLearner:
-    return GrpoLearner(network or tiny_network(), nft_config(**changes), rollout, seed=seed, ranks=ranks)
+def make(
+    network: torch.nn.Module | None = None, *, seed: int = 0, rollout: Any = ODE, **changes: Any
+) -> GrpoLearner:
+    return GrpoLearner(network or tiny_network(), nft_config(**changes), rollout, seed=seed)
 
 
 def buffer_of(learner: GrpoLearner, **changes: Any) -> RolloutBuffer:
@@ -238,37 +235,6 @@ def test_the_size_of_a_micro_batch_does_not_change_the_gradient(changes: dict[st
     for size in (1, 5):
         parts = gradient(make(micro_batch=size, **changes), buffer, ADVANTAGES)
         assert float((parts - wanted).norm() / wanted.norm()) < 1e-5
-
-
-class OneOfTwo(Ranks):
-    """A rank that is told nothing by the other one."""
-
-    def sum_(self, *tensors: Tensor) -> None:
-        pass
-
-
-def test_the_gradients_of_two_ranks_add_up_to_that_of_one_and_a_rank_without_rows_gives_zeros() -> None:
-    one = make()
-    buffer, rows = buffer_of(one), Rows(torch.tensor([0, 3, 3, 5, 7]), torch.tensor([1, 0, 2, 2, 2]))
-    halves = [gradient(make(ranks=OneOfTwo(rank, 2)), buffer, ADVANTAGES, rows) for rank in (0, 1)]
-    wanted = gradient(one, buffer, ADVANTAGES, rows)
-    assert float((halves[0] + halves[1] - wanted).norm() / wanted.norm()) < 1e-5
-    idle = gradient(make(ranks=OneOfTwo(1, 2)), buffer, ADVANTAGES, rows.part(torch.tensor([0])))
-    assert idle.shape == wanted.shape and not idle.any()
-
-
-@pytest.mark.slow
-def test_two_gloo_ranks_give_the_update_of_one(tmp_path: Path) -> None:
-    settings = nft_config(micro_batch=3, updates_per_buffer=3, learning_rate=1e-4, kl=FROZEN)
-    one = GrpoLearner(tiny_network(), settings, toy_rollout_settings(), seed=5)
-    report = one.train(toy_buffer(one.model, one.rollout))
-    mp.spawn(video_learner_rank, args=(2, str(tmp_path), settings), nprocs=2)
-    ranks = [torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in (0, 1)]
-    for name, tensor in weights(one.model).items():
-        assert torch.equal(ranks[0]["weights"][name], ranks[1]["weights"][name])
-        assert_close(ranks[0]["weights"][name], tensor, rtol=1e-4, atol=1e-6)
-    numbers = [[u.objective, u.kl, u.ratio_mean, u.clip_low_share, u.clip_high_share] for u in report.updates]
-    assert_close(ranks[0]["numbers"], torch.tensor(numbers), rtol=1e-3, atol=1e-6, equal_nan=True)
 
 
 # old weights
