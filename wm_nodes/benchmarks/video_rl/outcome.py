@@ -93,7 +93,7 @@ class OutcomeSource(JudgedContexts):
     def validate(self) -> Mapping[str, list[float]]:
         self.folder.network.eval()
         frames = sample_by_ode(self.folder, self._heldout, self.config, self.config.evaluation.num_steps)
-        scores = score_clips(frames, self._heldout, self.probe, self.folder.clip["num_conditioning"]).named()
+        scores = score_clips(frames, self._heldout, self.probe, self.folder.clip["num_conditioning"])
         return {name: scores[name].tolist() for name in SCORES}
 
 

@@ -136,12 +136,12 @@ def _measure(
 def measure_clips(
     frames: Tensor, positions: FloatArray, references: Clips, by: Yardstick, num_conditioning: int
 ) -> dict[str, Tensor]:
-    """Return by name, float64 (N,), all scores of ClipScores and find_faults of decoded clips, uint8 (N, F, H, W, 3),
+    """Return by name, float64 (N,), all scores of score_clips and find_faults of decoded clips, uint8 (N, F, H, W, 3),
     and where there is a reader `reader_success`: 1 where it sees the task done in the last frame.
 
     positions: what the probe reads in the clips, (N, F, P).
     """
-    scores = score_clips(frames, references, by.probe, num_conditioning).named()
+    scores = score_clips(frames, references, by.probe, num_conditioning)
     faults = find_faults(frames, positions, by.limits, by.scene, num_conditioning)
     if by.reader is None:
         return {**scores, **faults}
