@@ -354,7 +354,7 @@ def test_settings_that_the_graphs_model_or_the_ratio_cannot_have_are_refused_bef
 ) -> None:
     for setting, said in (
         ("grpo.kl.anchor=lora_off", "the graph's video model has none: take frozen"),
-        ("grpo.objective=nft", "objective nft has no transitions, got kl.beta 0.5 with kl.anchor dual"),
+        ("grpo.objective=nft", "objective nft has no KL, got kl.beta 0.5; set kl.beta 0"),
     ):
         run_dir = tmp_path / "run"
         assert main(["train-video-model", f"--{setting}", "--run-dir", str(run_dir)]) == 2

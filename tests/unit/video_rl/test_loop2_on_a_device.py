@@ -59,7 +59,7 @@ SMALL = {
     "rewards": {"psnr_db": 1.0, "tracking": 1.0},
 }
 """The preset gpu at a size for tests."""
-NFT = {"grpo.objective": "nft", "grpo.kl.anchor": "frozen"}
+NFT = {"grpo.objective": "nft", "grpo.kl.beta": 0.0}
 Found = dict[str, Tensor]
 
 

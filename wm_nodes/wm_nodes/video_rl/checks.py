@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from wm_nodes.config.load import load_video_config
-from wm_nodes.config.video import GrpoConfig, RolloutConfig, VideoRlConfig
+from wm_nodes.config.video import RolloutConfig, VideoRlConfig
 from wm_nodes.core.device import device_of
 from wm_nodes.video_model import Condition, RolloutBuffer, VideoRollout, initial_noise
 from wm_nodes.video_rl.grpo import GrpoLearner
@@ -39,7 +39,8 @@ class CheckResult:
 def examine(
     model: nn.Module, condition: Condition, shape: tuple[int, int, int, int], config: VideoRlConfig
 ) -> list[CheckResult]:
-    """Sample a few videos of shape (C, F, H, W) and check them; the model's weights are as before afterwards.
+    """Sample a few videos of shape (C, F, H, W) and check them; the model's weights are as before afterwards. With
+    objective nft, which has no ratio and no KL, no first update is made.
 
     Args:
         condition: of N >= 2 videos, where the model is; two of them at least should move.
@@ -54,22 +55,14 @@ def examine(
     noise = initial_noise(shape, seeds).to(device_of(model))
     model.eval()
     buffer = sample_buffer(model, config, condition, noise, seeds, group, videos, 0, 0)
-    sampled, trainable = buffer.rollout, [p.requires_grad for p in model.parameters()]
-    broken = (~sampled.latents.isfinite()).flatten(1).any(1)
+    broken = (~buffer.rollout.latents.isfinite()).flatten(1).any(1)
     if bool(broken.any()):
         return [CheckResult(
             "sampled videos are finite", False, f"{int(broken.sum())} of {len(broken)} are not",
             "float16 overflows where bfloat16 does not; check the weights, and the latents' scale",
         )]
-    try:
-        learner = GrpoLearner(model, _without_updates(config.grpo, rollout), rollout, seed=config.seed)
-        first = _check_first_update(learner, buffer)
-    finally:
-        for parameter, trains in zip(model.parameters(), trainable, strict=True):
-            parameter.requires_grad_(trains)
-            parameter.grad = None
-        model.eval()
-    return [*first, _check_mask(sampled, condition.num_conditioning, rollout)]
+    first = () if config.grpo.objective == "nft" else _check_first_update(model, buffer, config)
+    return [*first, _check_mask(buffer.rollout, condition.num_conditioning, rollout)]
 
 
 def _check_mask(sampled: VideoRollout, num_conditioning: int, rollout: RolloutConfig) -> CheckResult:
@@ -86,36 +79,33 @@ def _check_mask(sampled: VideoRollout, num_conditioning: int, rollout: RolloutCo
     )
 
 
-def _limits(rollout: RolloutConfig) -> tuple[float, float]:
-    """Return the limits of the ratio's distance from 1, and of the KL."""
-    if rollout.storage_dtype == "bfloat16":
-        return ROUNDED_RATIO_LIMIT, ROUNDED_KL_LIMIT
-    return RATIO_LIMIT, KL_LIMIT
-
-
-def _without_updates(grpo: GrpoConfig, rollout: RolloutConfig) -> GrpoConfig:
-    """Settings of one update that changes no weight; a transition beyond the ratio's limit counts as clipped."""
-    limit, _ = _limits(rollout)
-    anchor = "frozen" if grpo.objective == "nft" and grpo.kl.anchor != "lora_off" else grpo.kl.anchor
-    return grpo.with_values(
-        updates_per_buffer=1, learning_rate=0.0, weight_decay=0.0, clip=limit,
-        kl=grpo.kl.with_values(mode="mean", beta=1.0, anchor=anchor),
-        advantage=load_video_config("base").grpo.advantage,
+def _check_first_update(
+    model: nn.Module, buffer: RolloutBuffer, config: VideoRlConfig
+) -> tuple[CheckResult, CheckResult]:
+    """Make an update that changes no weight; a transition beyond the ratio's limit counts as clipped."""
+    ratio_limit, kl_limit = RATIO_LIMIT, KL_LIMIT
+    if config.rollout.storage_dtype == "bfloat16":
+        ratio_limit, kl_limit = ROUNDED_RATIO_LIMIT, ROUNDED_KL_LIMIT
+    settings = config.grpo.with_values(
+        updates_per_buffer=1, learning_rate=0.0, weight_decay=0.0, clip=ratio_limit,
+        kl=config.grpo.kl.with_values(mode="mean", beta=1.0), advantage=load_video_config("base").grpo.advantage,
     )
-
-
-def _check_first_update(learner: GrpoLearner, buffer: RolloutBuffer) -> tuple[CheckResult, CheckResult]:
-    (update,) = learner.train(buffer.with_rewards({"total": torch.arange(len(buffer), dtype=torch.float64)})).updates
-    ratio_limit, kl_limit = _limits(learner.rollout)
+    rewarded = buffer.with_rewards({"total": torch.arange(len(buffer), dtype=torch.float64)})
+    trainable = [p.requires_grad for p in model.parameters()]
+    try:
+        (update,) = GrpoLearner(model, settings, config.rollout, seed=config.seed).train(rewarded).updates
+    finally:
+        for parameter, trains in zip(model.parameters(), trainable, strict=True):
+            parameter.requires_grad_(trains)
+            parameter.grad = None
+        model.eval()
     error, outside = abs(update.ratio_mean - 1), update.clip_low_share + update.clip_high_share
-    has_ratio = learner.settings.objective == "ratio"
     return CheckResult(
-        "ratio is 1 on the first update", not has_ratio or (error < ratio_limit and outside == 0),
-        f"mean ratio differs from 1 by {error:.1e}, {outside:.0%} of the transitions by more than {ratio_limit:g}"
-        if has_ratio else "objective nft has none",
+        "ratio is 1 on the first update", error < ratio_limit and outside == 0,
+        f"mean ratio differs from 1 by {error:.1e}, {outside:.0%} of the transitions by more than {ratio_limit:g}",
         "make rollout and training pass alike: dtype, micro_batch, dropout off, attention kernels; storage_dtype "
         "float32",
     ), CheckResult(
-        "KL is 0 at the anchor", update.kl < kl_limit, f"{update.kl:.1e} to {learner.settings.kl.anchor}",
+        "KL is 0 at the anchor", update.kl < kl_limit, f"{update.kl:.1e} to {config.grpo.kl.anchor}",
         "as for the ratio",
     )

@@ -82,7 +82,7 @@ class LossTerms(NamedTuple):
     objective: Tensor
     """To be maximised."""
     kl: Tensor
-    """To the anchor; 0 where it has no weight."""
+    """To the anchor; 0 where it has no weight, and with objective nft."""
     log_ratio: Tensor | None
     """Of DD-15; None with objective nft."""
 
@@ -97,25 +97,14 @@ class LossTerms(NamedTuple):
         return sums
 
 
-class Anchored:
-    """A loss on `model` with weights of an anchor beside it: copies of the parameters that train, nothing else. With
-    LoRA they are as small as the adapter.
-
-    Raises:
-        ValueError: the anchor is a model without its adapter, and there is none.
-    """
+class Terms:
+    """A loss on `model` that may need other weights of it: copies of the parameters that train, nothing else. With LoRA
+    they are as small as the adapter."""
 
     def __init__(self, model: nn.Module, settings: GrpoConfig, rollout: RolloutConfig, seed: int) -> None:
-        if settings.kl.anchor == "lora_off" and not hasattr(model, "disable_adapter"):
-            raise ValueError(
-                "kl.anchor lora_off needs a model with a LoRA adapter; add one (video_model.adapters.add_lora), or "
-                "take kl.anchor frozen"
-            )
         self.model, self.settings, self.rollout, self.seed = model, settings, rollout, seed
         self.anchor: dict[str, Tensor] = {}
         """Parameters of a frozen anchor by name; empty where the buffer or the bare model is the anchor."""
-        if settings.kl.anchor in ("frozen", "dual"):
-            self.anchor = self.trained()
 
     def begin(self) -> None:
         """Called before the first update on a buffer."""
@@ -128,19 +117,23 @@ class Anchored:
         """The model with other weights, while the current ones keep their graph."""
         return lambda *arguments: functional_call(self.model, weights, arguments)
 
-    @contextmanager
-    def anchored(self) -> Iterator[Callable[..., Any]]:
-        """Give the model as it is at the anchor."""
-        if self.settings.kl.anchor != "lora_off":
-            yield self.at(self.anchor)
-            return
-        disable: Any = self.model.disable_adapter
-        with disable():
-            yield self.model
 
+class GrpoTerms(Terms):
+    """Objective and KL of transitions by the ratio of their likelihoods under `model`.
 
-class GrpoTerms(Anchored):
-    """Objective and KL of transitions by the ratio of their likelihoods under `model`."""
+    Raises:
+        ValueError: the anchor is a model without its adapter, and there is none.
+    """
+
+    def __init__(self, model: nn.Module, settings: GrpoConfig, rollout: RolloutConfig, seed: int) -> None:
+        if settings.kl.anchor == "lora_off" and not hasattr(model, "disable_adapter"):
+            raise ValueError(
+                "kl.anchor lora_off needs a model with a LoRA adapter; add one (video_model.adapters.add_lora), or "
+                "take kl.anchor frozen"
+            )
+        super().__init__(model, settings, rollout, seed)
+        if settings.kl.anchor in ("frozen", "dual"):
+            self.anchor = self.trained()
 
     def choose(self, buffer: RolloutBuffer) -> Tensor:
         """Return which transitions train, bool (N, S)."""
@@ -176,6 +169,16 @@ class GrpoTerms(Anchored):
                 target = self._transition(model, buffer, rows).zeta
             kl = kl + self._distance(new, target)
         return kl
+
+    @contextmanager
+    def anchored(self) -> Iterator[Callable[..., Any]]:
+        """Give the model as it is at the anchor."""
+        if self.settings.kl.anchor != "lora_off":
+            yield self.at(self.anchor)
+            return
+        disable: Any = self.model.disable_adapter
+        with disable():
+            yield self.model
 
     # internals
 
