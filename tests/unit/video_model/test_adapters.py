@@ -597,6 +597,11 @@ class TestFolder:
         (other / "model_index.json").write_text(json.dumps({"_class_name": "LTXPipeline"}))
         with pytest.raises(ModelFolderError, match="LTXPipeline; supported are WanPipeline"):
             load_public_model(other)
+        slow = self.copy(folder, tmp_path / "slow")
+        scheduler = json.loads((slow / "scheduler" / "scheduler_config.json").read_text())
+        (slow / "scheduler" / "scheduler_config.json").write_text(json.dumps({**scheduler, "num_train_timesteps": 500}))
+        with pytest.raises(ModelFolderError, match="num_train_timesteps 500; Wan is supported with 1000"):
+            load_public_model(slow)
         index = json.loads((folder / "model_index.json").read_text())
         index["transformer_2"] = index["transformer"]
         (other / "model_index.json").write_text(json.dumps(index))

@@ -86,8 +86,6 @@ class BufferReport:
     """Noise budget that was spent, see VideoRollout.spent_noise."""
     raw_rewards: Mapping[str, float]
     """Mean of each score beside the total over the videos that have it, NaN where none has."""
-    step_noise: Mapping[int, float]
-    """noise_share of each stochastic sampler step."""
 
 
 class GrpoLearner:
@@ -179,7 +177,6 @@ class GrpoLearner:
                 name: float(values[torch.isfinite(values)].mean())
                 for name, values in buffer.rewards.items() if name != "total"
             },
-            step_noise=dict(zip(buffer.rollout.steps, buffer.rollout.noise_share.tolist(), strict=True)),
         )
 
     def rows(self, buffer: RolloutBuffer, kept_N: Tensor) -> Rows:

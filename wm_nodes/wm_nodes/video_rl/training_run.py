@@ -119,10 +119,9 @@ class VideoRun(TrainingRun):
 def flatten_metrics(report: BufferReport) -> dict[str, float]:
     """Return one number per name; those of the k-th optimizer step on a buffer end in _<k>, from 1."""
     values = asdict(report)
-    updates, rewards, noise = (values.pop(name) for name in ("updates", "raw_rewards", "step_noise"))
+    updates, rewards = values.pop("updates"), values.pop("raw_rewards")
     metrics = {name: float(value) for name, value in values.items()}
     metrics |= {f"reward_{name}": value for name, value in rewards.items()}
-    metrics |= {f"noise_share_step_{k}": value for k, value in noise.items()}
     for index, update in enumerate(updates, 1):
         metrics |= {f"{name}_{index}": float(value) for name, value in update.items()}
     return metrics

@@ -13,7 +13,7 @@ from wm_nodes.core.model_folder import ModelFolderError, read_json
 from wm_nodes.video_model.adapters.codec import VideoCodec
 from wm_nodes.video_model.adapters.cosmos import CosmosVelocity
 from wm_nodes.video_model.adapters.velocity import PublicVelocity, package
-from wm_nodes.video_model.adapters.wan import WanVelocity
+from wm_nodes.video_model.adapters.wan import TIME_SCALE, WanVelocity
 from wm_nodes.video_model.conditions import Condition
 
 WAN, COSMOS = ("WanPipeline", "WanImageToVideoPipeline"), "Cosmos2_5_PredictBasePipeline"
@@ -80,6 +80,10 @@ def load_public_model(
         raise ModelFolderError(
             f"{folder} holds two experts (Wan 2.2 A14B), which are not supported; take Wan 2.1 or Wan 2.2 TI2V-5B"
         )
+    if kind in WAN and (steps := scheduler.get("num_train_timesteps", TIME_SCALE)) != TIME_SCALE:
+        raise ModelFolderError(
+            f"{folder / 'scheduler'} has num_train_timesteps {steps}; Wan is supported with {TIME_SCALE}"
+        )
     encoder, network = transformers.UMT5EncoderModel, diffusers.WanTransformer3DModel
     if kind == COSMOS:
         encoder, network = transformers.Qwen2_5_VLForConditionalGeneration, diffusers.CosmosTransformer3DModel
@@ -95,8 +99,7 @@ def load_public_model(
     null_text = embed_prompts(pipeline, [negative_prompt])[0]
     try:
         velocity = CosmosVelocity(transformer, null_text) if kind == COSMOS else WanVelocity(
-            transformer, null_text, fused=bool(index.get("expand_timesteps")),
-            time_scale=float(scheduler.get("num_train_timesteps", 1000)),
+            transformer, null_text, fused=bool(index.get("expand_timesteps"))
         )
     except ValueError as error:
         raise ModelFolderError(f"{folder / 'transformer'}: {error}") from error
