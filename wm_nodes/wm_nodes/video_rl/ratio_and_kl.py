@@ -21,7 +21,9 @@ from torch.func import functional_call
 
 from wm_nodes.config.video import GrpoConfig, RolloutConfig
 from wm_nodes.core.device import device_of
-from wm_nodes.video_model import GaussianTransition, RolloutBuffer, flow_times, select_steps, transition
+from wm_nodes.video_model import RolloutBuffer, StepContext, flow_times, guided_velocity, select_steps, step
+from wm_nodes.video_model.kernels import with_conditioning
+from wm_nodes.video_model.sampling import normalised_noise
 
 
 def log_ratio(new_zeta_MU: Tensor, old_zeta_MU: Tensor, weight_MU: Tensor | float = 1.0) -> Tensor:
@@ -74,6 +76,15 @@ class Rows:
         places = self.positions if positions is None else positions
         index = torch.stack([self.videos, places]).to(stored.device)
         return stored[index[0], index[1]]
+
+
+class GaussianTransition(NamedTuple):
+    """The Gaussian of M stored transitions under the weights of now."""
+
+    zeta: Tensor
+    """(x_s - mean) / std, (M, U), with gradient."""
+    std: Tensor
+    """(M, U), without."""
 
 
 class LossTerms(NamedTuple):
@@ -148,7 +159,7 @@ class GrpoTerms(Terms):
         Args:
             signals_M: the advantages. version: optimizer steps made, for the dual anchor.
         """
-        new = self._transition(self.model, buffer, rows)
+        new = self.transition(self.model, buffer, rows)
         old_zeta = rows.of(buffer.rollout.zeta).flatten(1).float().to(new.zeta.device)
         ratio = self._log_ratio(new, old_zeta)
         objective = clipped_objective(ratio, signals_M, self.settings.clip)
@@ -166,7 +177,7 @@ class GrpoTerms(Terms):
         due = settings.anchor in ("frozen", "lora_off") or version % settings.dual_every == 0
         if settings.anchor != "buffer" and due:
             with torch.no_grad(), self.anchored() as model:
-                target = self._transition(model, buffer, rows).zeta
+                target = self.transition(model, buffer, rows).zeta
             kl = kl + self._distance(new, target)
         return kl
 
@@ -180,18 +191,23 @@ class GrpoTerms(Terms):
         with disable():
             yield self.model
 
-    # internals
-
-    def _transition(self, model: Callable[..., Any], buffer: RolloutBuffer, rows: Rows) -> GaussianTransition:
+    def transition(self, model: Callable[..., Any], buffer: RolloutBuffer, rows: Rows) -> GaussianTransition:
+        """Return the normalised noise that leads the rows from x_t to x_s under `model` (DD-1)."""
         device, rollout = device_of(self.model), buffer.rollout
         times = flow_times(self.rollout.num_steps, self.rollout.shift)
         steps = torch.tensor(rollout.steps)[rows.positions]
         where = torch.tensor([rollout.state_steps.index(k) for k in rollout.steps])[rows.positions]
-        x_t, x_s = (rows.of(rollout.states, places).to(device) for places in (where, where + 1))
+        x_t, x_s = (rows.of(rollout.states, places).to(device).float() for places in (where, where + 1))
         t, s = times[torch.stack([steps, steps + 1])].to(device)
         condition = buffer.condition.rows(rows.videos.to(buffer.condition.frames.device)).to(device)
-        mask = rows.of(rollout.mask).to(device)
-        return transition(model, condition, x_t, x_s, t, s, mask, self.rollout)
+        context = StepContext(condition.frames.float(), float(times[1]), rows.of(rollout.mask).to(device))
+        x, K = with_conditioning(x_t, context.conditioning), condition.num_conditioning
+        v = guided_velocity(model, x, t, condition, self.rollout.cfg).float()
+        law = step(x, v, t, s, context, self.rollout.sampler)
+        zeta = normalised_noise(x_s, law, K)
+        return GaussianTransition(zeta.flatten(1), law.std[:, :, K:].expand_as(zeta).flatten(1))
+
+    # internals
 
     def _log_ratio(self, new: GaussianTransition, old_zeta: Tensor) -> Tensor:
         return log_ratio(
