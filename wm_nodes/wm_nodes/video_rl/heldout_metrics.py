@@ -141,12 +141,11 @@ def measure_clips(
 
     positions: what the probe reads in the clips, (N, F, P).
     """
-    scores = score_clips(frames, references, by.probe, num_conditioning)
-    faults = find_faults(frames, positions, by.limits, by.scene, num_conditioning)
-    if by.reader is None:
-        return {**scores, **faults}
-    read = torch.from_numpy(by.reader.done(frames[:, -1]).astype(np.float64))
-    return {**scores, **faults, "reader_success": read}
+    found = score_clips(frames, references, by.probe, num_conditioning)
+    found |= find_faults(frames, positions, by.limits, by.scene, num_conditioning)
+    if by.reader is not None:
+        found["reader_success"] = torch.from_numpy(by.reader.done(frames[:, -1]).astype(np.float64))
+    return found
 
 
 def measure_executability(
