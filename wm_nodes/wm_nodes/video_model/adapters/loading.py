@@ -18,7 +18,7 @@ from wm_nodes.video_model.conditions import Condition
 
 WAN, COSMOS = ("WanPipeline", "WanImageToVideoPipeline"), "Cosmos2_5_PredictBasePipeline"
 MAX_TOKENS = 512
-"""Of an embedded prompt: the models attend to its padding, with which they were trained."""
+"""Of an embedded prompt with its padding, to which the models attend."""
 REMEDY = "download the whole model again in its diffusers layout (with safetensors), and name that folder"
 
 
