@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.distributed as dist
 from recording_samples import make_spec
 from torch import Tensor, nn
 from torch.distributions import Normal
@@ -18,7 +17,6 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import AdvantageConfig, GrpoConfig, KlConfig, MaskConfig, RolloutConfig, SamplerConfig
 from wm_nodes.core.types import FloatArray
 from wm_nodes.judge.one_class.ranges import load_ranges, save_ranges, strides_of
-from wm_nodes.training.ranks import Ranks
 from wm_nodes.video_model import (
     Condition,
     NetworkSettings,
@@ -204,18 +202,6 @@ def train_rounds(learner: GrpoLearner, rounds: range) -> None:
 
 def weights(model: nn.Module) -> dict[str, Tensor]:
     return {name: tensor.detach().clone() for name, tensor in model.state_dict().items()}
-
-
-def video_learner_rank(rank: int, size: int, folder: str, settings: GrpoConfig) -> None:
-    """One process of a learner; every rank samples the same buffer and saves its weights and its report."""
-    torch.set_num_threads(1)
-    dist.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=size)
-    learner = GrpoLearner(tiny_network(), settings, toy_rollout_settings(), seed=5, ranks=Ranks(rank, size))
-    buffer = toy_buffer(learner.model, learner.rollout)
-    report = learner.train(replace(buffer))
-    numbers = [[u.objective, u.kl, u.ratio_mean, u.clip_low_share, u.clip_high_share] for u in report.updates]
-    torch.save({"weights": weights(learner.model), "numbers": torch.tensor(numbers)}, Path(folder) / f"rank{rank}.pt")
-    dist.destroy_process_group()
 
 
 def far_sighted_judge(folder: Path) -> Path:

@@ -223,11 +223,10 @@ def test_recorded_verdicts_are_given_again_bit_for_bit_without_asking_the_judge(
     bag = folder / stopped.bag_uri
     (clips,) = read_clips(bag, pictures=True)
     assert clips.iteration == done.iterations - 1 and clips.weights["agent"] == 1
-    told = {verdict.clip: verdict.audit_id for verdict in probe.messages["reward/verdict"]}
-    assert dict(enumerate(clips.audit_ids)) == told
+    told = [verdict.audit_id for verdict in probe.messages["reward/verdict"]]
     assert not verify(folder / "audit").problems
     logged = {entry.verdict.audit_id: entry for entry in read_record(folder / "audit").judged() if entry.verdict}
-    assert all(logged[audit_id].round_number == clips.iteration for audit_id in told.values())
+    assert all(logged[audit_id].round_number == clips.iteration for audit_id in told)
 
     shutil.copytree(judged.bag, run / "data" / "train" / "shard_00000000")
     shutil.copytree(judged.model, run / "video_model")
@@ -245,15 +244,18 @@ def test_recorded_verdicts_are_given_again_bit_for_bit_without_asking_the_judge(
     assert len(server.requests) > asked
     assert main(["rescore", str(run), "--reward", "reference"]) == 0
     assert "by other rewards than recorded, so it is not compared" in said(capsys)
-    silent = replace(clips, audit_ids=("", *clips.audit_ids[1:]), total=clips.total.clone())
-    silent.total[0] = math.nan
-    other = replace(clips, audit_ids=("0" * 64, *clips.audit_ids[1:]))
+    silent, other = (
+        replace(clips, scores={**clips.scores, "agent": clips.scores["agent"].clone()}, total=clips.total.clone())
+        for _ in range(2)
+    )
+    silent.scores["agent"][0] = silent.total[0] = math.nan
+    other.scores["agent"][0] += 1e-15
     monkeypatch.setattr("wm_nodes.video_rl.recorded_buffers.read_clips", lambda bag, pictures: [silent])
     assert main(["rescore", str(run), *agent]) == 0
-    assert "1 clips that got no answer then are not compared" in said(capsys)
+    assert "1 clips that got no reward then are not compared" in said(capsys)
     monkeypatch.setattr("wm_nodes.video_rl.recorded_buffers.read_clips", lambda bag, pictures: [other])
     assert main(["rescore", str(run), *agent]) == 1
-    assert json.loads((run / "rescored.json").read_text())["buffers"][0]["different"] == ["verdicts"]
+    assert json.loads((run / "rescored.json").read_text())["buffers"][0]["different"] == ["agent"]
 
 
 def said(capsys: pytest.CaptureFixture[str]) -> str:

@@ -36,7 +36,7 @@ from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.execution_reward import EXECUTION_SCORES
 from wm_nodes.video_rl.recorded_buffers import RecordedClips, read_clips, rescore
-from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, ClipScores, load_probe
+from wm_nodes.video_rl.reference_reward import CLIP_SCORES, PICTURE_SCORES, load_probe
 from wm_nodes.video_rl.sampling import RecordedContexts
 from wm_nodes.video_rl.train import post_train, sample_buffers
 from wm_nodes.video_rl.training_run import CHECKPOINT, VIDEO_FILES, VideoRun, progress
@@ -132,7 +132,7 @@ def test_the_newest_weights_are_measured_after_and_the_base_model_once_before(
 def test_every_metric_is_in_the_document_and_tensorboard_has_them_too(run_dir: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    scores = {*ClipScores.__dataclass_fields__, *PICTURE_SCORES, *EXECUTION_SCORES}
+    scores = {*CLIP_SCORES, *PICTURE_SCORES, *EXECUTION_SCORES}
     assert [line["step"] for line in read_metrics(run_dir, "grpo")] == [1, 2]
     assert [line["step"] for line in read_metrics(run_dir, "heldout")] == [1, 2]
     for line in read_metrics(run_dir):
@@ -354,7 +354,7 @@ def test_settings_that_the_graphs_model_or_the_ratio_cannot_have_are_refused_bef
 ) -> None:
     for setting, said in (
         ("grpo.kl.anchor=lora_off", "the graph's video model has none: take frozen"),
-        ("grpo.objective=nft", "objective nft has no transitions, got kl.beta 0.5 with kl.anchor dual"),
+        ("grpo.objective=nft", "objective nft has no KL, got kl.beta 0.5; set kl.beta 0"),
     ):
         run_dir = tmp_path / "run"
         assert main(["train-video-model", f"--{setting}", "--run-dir", str(run_dir)]) == 2

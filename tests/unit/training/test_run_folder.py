@@ -17,7 +17,7 @@ class CountingRun(TrainingRun):
     files, checkpoint = VersionFiles("policies/policy"), "checkpoints/learner.json"
 
     def __init__(self, run_dir: Path, keep_versions: int) -> None:
-        super().__init__(run_dir, keep_versions, None)
+        super().__init__(run_dir, keep_versions)
         self.network, self.made, self.full = torch.nn.Linear(1, 1, bias=False), 0, False
 
     @property
@@ -27,9 +27,6 @@ class CountingRun(TrainingRun):
     @property
     def updates(self) -> int:
         return self.made
-
-    def follow(self) -> None:
-        raise NotImplementedError
 
     def write_files(self) -> PackedWeights:
         if self.full:

@@ -42,13 +42,13 @@ from wm_nodes.video_model import (  # noqa: E402
 from wm_nodes.video_model.adapters import (  # noqa: E402
     CosmosVelocity,
     PublicVelocity,
-    TextEncoder,
     VideoCodec,
     WanVelocity,
     add_lora,
     load_public_model,
     save_lora,
 )
+from wm_nodes.video_model.adapters.loading import embed_prompts  # noqa: E402
 from wm_nodes.video_model.kernels import ode_step, with_conditioning  # noqa: E402
 from wm_nodes.video_rl.grpo import GrpoLearner  # noqa: E402
 
@@ -297,18 +297,18 @@ class TestGuidance:
         drop = torch.tensor([True])
         with pytest.raises(ValueError, match="negative prompt"):
             WanVelocity(wan_transformer())(NOISE, torch.tensor([0.5]), given(), drop)
-        with pytest.raises(ValueError, match="same TextEncoder"):
+        with pytest.raises(ValueError, match="embed both with embed_prompts"):
             WanVelocity(wan_transformer(), NULL[0, :3])(NOISE, torch.tensor([0.5]), given(), drop)
 
 
 class TestText:
     @pytest.mark.parametrize("kind", ["wan", "cosmos2.5"])
-    def test_prompts_are_padded_to_one_length_and_offloading_changes_nothing(self, kind: str) -> None:
+    def test_prompts_are_padded_to_one_length(self, kind: str) -> None:
         pipeline = {"wan": wan_pipeline, "cosmos2.5": cosmos25_pipeline}[kind]()
         prompts = ["push  the cube &amp; left", "push"]
-        text = TextEncoder(pipeline, max_tokens=12).encode(prompts)
-        assert text.shape == (2, 12, E if kind == "wan" else 32) and not text.requires_grad
-        assert torch.equal(TextEncoder(pipeline, max_tokens=12, offload=True).encode(prompts), text)
+        text = embed_prompts(pipeline, prompts)
+        assert text.shape == (2, 512, E if kind == "wan" else 32) and not text.requires_grad
+        assert not torch.equal(text[0], text[1])
 
     def test_projected_text_gives_the_same_velocity_in_less_memory(self) -> None:
         changes = {
@@ -441,7 +441,7 @@ class TestLora:
 
 
 class TestCodec:
-    def test_latents_are_the_pipelines_and_offloading_changes_nothing(self) -> None:
+    def test_latents_are_the_pipelines_and_become_frames_again(self) -> None:
         vae, frames = tiny_vae(), picture().repeat(2, 9, 1, 1, 1)
         latents = VideoCodec(vae).encode(frames)
         assert latents.shape == (2, C, 3, 4, 4)
@@ -449,9 +449,7 @@ class TestCodec:
         video = diffusers.video_processor.VideoProcessor(8).preprocess_video([list(frames[0].float().numpy() / 255)])
         theirs = (vae.encode(video).latent_dist.mode() - mean) / std
         assert_close(latents[:1], theirs, atol=1e-5, rtol=1e-5)
-        offloaded = VideoCodec(vae, offload=True)
-        assert torch.equal(offloaded.encode(frames), latents)
-        decoded = offloaded.decode(latents)
+        decoded = VideoCodec(vae).decode(latents)
         assert decoded.shape == frames.shape and decoded.dtype == torch.uint8
 
     def test_sizes_that_it_does_not_divide_are_named(self) -> None:
@@ -496,10 +494,10 @@ class TestFolder:
         return to
 
     def test_wan_folder_loads_and_samples_as_the_pipeline_it_was(self, folder: Path) -> None:
-        loaded = load_public_model(folder, max_tokens=12, negative_prompt="left", offload=True)
+        loaded = load_public_model(folder, negative_prompt="left")
         assert isinstance(loaded.velocity, WanVelocity) and loaded.velocity.fused
-        assert loaded.shift == 5.0 and loaded.text is not None
-        text, frames = loaded.text.encode(["push the cube"]), loaded.codec.encode(picture())
+        assert loaded.shift == 5.0
+        text, frames = embed_prompts(loaded.pipeline, ["push the cube"]), loaded.codec.encode(picture())
         model = WanVelocity(wan_transformer(), loaded.velocity.null_text, fused=True)
         for cfg in (1.0, 4.0):
             args = (NOISE, torch.tensor([0.5]), given(frames, text), cfg)
@@ -535,12 +533,12 @@ class TestFolder:
         assert scope["learner"].version == 4 and scope["clips"].condition.num_conditioning == 0
 
     def test_bfloat16_and_checkpointing(self, folder: Path) -> None:
-        loaded = load_public_model(folder, dtype="bfloat16", gradient_checkpointing=True, max_tokens=12)
-        assert loaded.text.encode(["push"]).dtype == torch.bfloat16
+        loaded = load_public_model(folder, dtype="bfloat16", gradient_checkpointing=True)
+        assert embed_prompts(loaded.pipeline, ["push"]).dtype == torch.bfloat16
         assert loaded.codec.vae.dtype == torch.float32, "the VAE keeps its own"
         assert loaded.velocity.transformer.patch_embedding.weight.dtype == torch.bfloat16
         frames = loaded.codec.encode(picture())
-        text = loaded.text.encode(["push"])
+        text = embed_prompts(loaded.pipeline, ["push"])
         out = loaded.velocity(NOISE, torch.tensor([0.5]), given(frames, text), torch.tensor([True]))
         assert bool(out.isfinite().all())
         out.square().sum().backward()
@@ -549,9 +547,10 @@ class TestFolder:
         pipeline = cosmos25_pipeline(transformer=cosmos_transformer(concat_padding_mask=True, text_embed_dim=32))
         pipeline.register_modules(safety_checker=None)
         pipeline.save_pretrained(tmp_path, safe_serialization=True)
-        loaded = load_public_model(tmp_path, max_tokens=12)
+        loaded = load_public_model(tmp_path)
         assert isinstance(loaded.velocity, CosmosVelocity)
-        condition, t = given(loaded.codec.encode(picture()), loaded.text.encode(["push"])), torch.tensor([0.5])
+        condition = given(loaded.codec.encode(picture()), embed_prompts(loaded.pipeline, ["push"]))
+        t = torch.tensor([0.5])
         assert bool(guided_velocity(loaded.velocity, NOISE, t, condition, 2.0).isfinite().all())
 
     def test_incomplete_folders_are_named_with_a_remedy(self, folder: Path, tmp_path: Path) -> None:
@@ -598,6 +597,11 @@ class TestFolder:
         (other / "model_index.json").write_text(json.dumps({"_class_name": "LTXPipeline"}))
         with pytest.raises(ModelFolderError, match="LTXPipeline; supported are WanPipeline"):
             load_public_model(other)
+        slow = self.copy(folder, tmp_path / "slow")
+        scheduler = json.loads((slow / "scheduler" / "scheduler_config.json").read_text())
+        (slow / "scheduler" / "scheduler_config.json").write_text(json.dumps({**scheduler, "num_train_timesteps": 500}))
+        with pytest.raises(ModelFolderError, match="num_train_timesteps 500; Wan is supported with 1000"):
+            load_public_model(slow)
         index = json.loads((folder / "model_index.json").read_text())
         index["transformer_2"] = index["transformer"]
         (other / "model_index.json").write_text(json.dumps(index))

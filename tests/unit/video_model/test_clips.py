@@ -57,13 +57,13 @@ def test_a_clip_equal_to_its_recording_has_full_scores_and_a_shifted_object_lose
     positions[0, 2, 0] = 20
     clips = recorded(positions)
     same = score_clips(clips.frames, clips, TruthfulProbe(), 1)  # type: ignore[arg-type]
-    assert float(same.tracking) == pytest.approx(1.0) and float(same.object_cm) == pytest.approx(0.0)
-    assert float(same.scenery) == 0.0 and float(same.psnr_db) == pytest.approx(80.0)
+    assert float(same["tracking"]) == pytest.approx(1.0) and float(same["object_cm"]) == pytest.approx(0.0)
+    assert float(same["scenery"]) == 0.0 and float(same["psnr_db"]) == pytest.approx(80.0)
     moved = clips.frames.clone()
     moved[0, 1:, 0, 0, 0] += 3  # both generated frames: the object 3 cm off, the tool where it should be
     off = score_clips(moved, clips, TruthfulProbe(), 1)  # type: ignore[arg-type]
-    assert float(off.object_cm) == pytest.approx(3.0, abs=1e-4)
-    assert float(off.tracking) == pytest.approx((np.exp(-1) + 1) / 2, abs=1e-5)
+    assert float(off["object_cm"]) == pytest.approx(3.0, abs=1e-4)
+    assert float(off["tracking"]) == pytest.approx((np.exp(-1) + 1) / 2, abs=1e-5)
     with pytest.raises(ValueError, match="their recordings"):
         score_clips(moved[:, :2], clips, TruthfulProbe(), 1)  # type: ignore[arg-type]
 

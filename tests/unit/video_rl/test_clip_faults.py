@@ -7,7 +7,7 @@ from torch import Tensor
 
 from wm_nodes.config.load import load_config
 from wm_nodes.core.types import FloatArray
-from wm_nodes.video_rl.clip_faults import FaultLimits, find_faults, measure_fault_limits, seen_at
+from wm_nodes.video_rl.clip_faults import FaultLimits, find_faults, measure_fault_limits, object_seen_at
 from wm_nodes.video_rl.heldout_metrics import filmed_scene
 from wm_nodes.world_model.positions import position_names
 
@@ -15,7 +15,7 @@ SIMULATION = load_config("smoke").simulation
 SCENE = filmed_scene("push_cube", SIMULATION, 64)
 NAMES = position_names("push_cube")
 LIMITS = FaultLimits(tool_step_m=0.15, object_px=6)
-OBJECT_X, TOOL_X, TOOL_Z = (NAMES.index(name) for name in ("object_x", "tool_x", "tool_z"))
+TOOL_X = NAMES.index("tool_x")
 GREEN, TABLE = (20, 160, 40), (200, 190, 170)
 
 
@@ -27,10 +27,9 @@ def still(frames: int = 5) -> FloatArray:
 
 def drawn(positions: FloatArray) -> Tensor:
     """Two views; the left one has a square of 6 x 6 px where the side camera sees the object."""
-    index, camera = SCENE.cameras[0]
     images = np.full((*positions.shape[:2], 64, 128, 3), TABLE, np.uint8)
-    for frame, (column, row) in enumerate(seen_at(positions[0], SCENE, camera)[0].round().astype(int)):
-        images[0, frame, row - 3 : row + 3, 64 * index + column - 3 : 64 * index + column + 3] = GREEN
+    for frame, (column, row) in enumerate(object_seen_at(positions[0], SCENE).round().astype(int)):
+        images[0, frame, row - 3 : row + 3, 64 * SCENE.view + column - 3 : 64 * SCENE.view + column + 3] = GREEN
     return torch.from_numpy(images)
 
 
@@ -41,19 +40,7 @@ def faults(positions: FloatArray, frames: Tensor | None = None) -> dict[str, flo
 
 
 def test_a_clip_in_which_nothing_happens_has_no_faults() -> None:
-    assert faults(still()) == {
-        "ghost_motion": 0, "impossible_tool_steps": 0, "object_permanence": 1, "scenery_change": 0
-    }
-
-
-def test_an_object_that_moves_alone_is_a_ghost_and_one_beside_the_tool_is_not() -> None:
-    positions = still()
-    positions[0, 2:, OBJECT_X] = -0.03
-    assert faults(positions)["ghost_motion"] == 0.25
-    positions[0, :3, [TOOL_X, TOOL_Z]] = [[0.05], [0.02]]
-    assert faults(positions)["ghost_motion"] == 0
-    positions[0, 2:, OBJECT_X] = -0.01
-    assert faults(positions)["ghost_motion"] == 0, "less than 2 cm is noise of the reader"
+    assert faults(still()) == {"impossible_tool_steps": 0, "object_permanence": 1}
 
 
 def test_a_tool_step_above_the_limit_counts() -> None:
@@ -69,18 +56,6 @@ def test_an_object_that_vanishes_is_missed_whatever_its_colour_and_another_view_
     assert found["object_permanence"] == 0
     frames[0, -1, 10:20, 80:90] = torch.tensor(GREEN, dtype=torch.uint8)
     assert faults(positions, frames)["object_permanence"] == 1
-
-
-def test_scenery_is_what_the_still_camera_sees_away_from_tool_and_object() -> None:
-    positions, frames = still(), drawn(still())
-    frames[0, 1:, :, 64:] = 0
-    assert faults(positions, frames)["scenery_change"] == 0, "the camera on the hand moves"
-    _, camera = SCENE.cameras[0]
-    column, row = seen_at(positions[0, 0], SCENE, camera)[1].round().astype(int)
-    frames[0, 1:, row - 8, column] = 0
-    assert faults(positions, frames)["scenery_change"] == 0, "the hand hides what is above the tool"
-    frames[0, 1:, 60:, :64] = 0
-    assert 0.02 < faults(positions, frames)["scenery_change"] < 0.2
 
 
 def test_limits_are_quantiles_of_recordings() -> None:

@@ -128,7 +128,7 @@ def test_a_group_is_trained_and_evaluated_by_closeness_where_no_recording_has_si
     frames, given = folder.codec.decode(buffer.rollout.latents), buffer.condition.num_conditioning
     wanted = score_pictures(frames, source.references(request), folder.codec, given)
     assert torch.equal(buffer.rewards["total"], wanted["closeness"]) and buffer.valid.all()
-    assert buffer.rewards["tracking"].isnan().all() and buffer.rewards["motion"].isnan().all()
+    assert buffer.rewards["tracking"].isnan().all() and buffer.rewards["outcome"].isnan().all()
     assert report.reward_mean == pytest.approx(float(wanted["closeness"].mean())) and learner.version > 0
     heldout = context_scores(folder, blind, probe, config)
     assert heldout["closeness"].isfinite().all() and set(PICTURE_SCORES) <= set(WATCHED)

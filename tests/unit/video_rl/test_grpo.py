@@ -1,4 +1,4 @@
-"""The GRPO learner on a tiny network: exact ratios and gradients, anchors, ranks, resume, refusals. Ids: spec 4.1."""
+"""The GRPO learner on a tiny network: exact ratios and gradients, anchors, resume, refusals. Ids: spec 4.1."""
 
 import math
 from collections.abc import Iterator
@@ -9,10 +9,8 @@ from typing import Any
 
 import pytest
 import torch
-import torch.multiprocessing as mp
 from safetensors.torch import save
 from torch import Tensor
-from torch.testing import assert_close
 from video_toys import (
     SHAPE,
     Analytic,
@@ -25,12 +23,10 @@ from video_toys import (
     toy_buffer,
     toy_rollout_settings,
     train_rounds,
-    video_learner_rank,
     weights,
 )
 
 from wm_nodes.config.video import GrpoConfig, RolloutConfig
-from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import WeightsError
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError, StepContext, VideoNetwork, step
 from wm_nodes.video_rl.group_advantages import GroupAdvantages
@@ -46,10 +42,11 @@ def grpo(**changes: Any) -> GrpoConfig:
     return grpo_config(**{"learning_rate": 1e-3, "micro_batch": 8, "step_fraction": 0.8, **changes})
 
 
-def make(rollout: RolloutConfig | None = None, *, network: VideoNetwork | None = None, seed: int = 0,
-         ranks: Ranks | None = None, **changes: Any) -> GrpoLearner:
+def make(
+    rollout: RolloutConfig | None = None, *, network: VideoNetwork | None = None, seed: int = 0, **changes: Any
+) -> GrpoLearner:
     network = network or tiny_network()
-    return GrpoLearner(network, grpo(**changes), rollout or toy_rollout_settings(micro_batch=8), seed=seed, ranks=ranks)
+    return GrpoLearner(network, grpo(**changes), rollout or toy_rollout_settings(micro_batch=8), seed=seed)
 
 
 def buffer_of(learner: GrpoLearner, **changes: Any) -> RolloutBuffer:
@@ -178,7 +175,7 @@ def test_training_leaves_no_gradient_on_what_was_stored() -> None:
         assert not tensor.requires_grad and tensor.grad is None, name
 
 
-# accumulation and ranks
+# accumulation
 
 
 @pytest.mark.parametrize("changes", [{}, {"kl": kl_config("mean", 0.5, "frozen")}])
@@ -189,58 +186,6 @@ def test_the_size_of_a_micro_batch_does_not_change_the_gradient(changes: dict[st
     for size in (1, 3, 7):
         parts = gradient(make(micro_batch=size, clip=0.5, **changes), buffer)
         assert float((parts - wanted).norm() / wanted.norm()) < 1e-5
-
-
-class OneOfTwo(Ranks):
-    """A rank that is told nothing by the other one."""
-
-    def sum_(self, *tensors: Tensor) -> None:
-        pass
-
-    def sum_gradients(self, module: torch.nn.Module) -> None:
-        pass
-
-
-def test_the_gradients_of_two_ranks_add_up_to_that_of_one() -> None:
-    one = make()
-    buffer = buffer_of(one)
-    rows = Rows(torch.tensor([0, 3, 3, 5, 7]), torch.tensor([1, 0, 4, 2, 2]))
-    halves = [gradient(make(ranks=OneOfTwo(rank, 2)), buffer, rows) for rank in (0, 1)]
-    wanted = gradient(one, buffer, rows)
-    assert float((halves[0] + halves[1] - wanted).norm() / wanted.norm()) < 1e-5
-    assert float((halves[0] - wanted).norm() / wanted.norm()) > 0.1
-
-
-def test_a_rank_without_a_transition_has_a_gradient_of_zero_and_counts_nothing() -> None:
-    """Fewer transitions than ranks: it must still take part in the sums."""
-    learner = make(ranks=OneOfTwo(1, 2))
-    buffer = buffer_of(learner)
-    sums = learner.gradients(buffer, Rows(torch.tensor([0]), torch.tensor([1])), SIGNAL)
-    assert all(math.isfinite(value) for value in sums.values()) and sums["objective"] == sums["clip_low_share"] == 0.0
-    given = [None if p.grad is None else bool(p.grad.any()) for p in learner.parameters]
-    full = make()
-    gradient(full, buffer)
-    assert given == [None if p.grad is None else False for p in full.parameters], "a gradient wherever others have one"
-
-
-@pytest.mark.slow
-def test_two_gloo_ranks_give_the_update_of_one(tmp_path: Path) -> None:
-    settings = grpo(
-        micro_batch=3,
-        updates_per_buffer=3,
-        clip=0.1,
-        learning_rate=1e-4,
-        kl=kl_config(anchor="dual", dual_every=1),
-    )
-    one = GrpoLearner(tiny_network(), settings, toy_rollout_settings(), seed=5)
-    report = one.train(toy_buffer(one.model, one.rollout))
-    mp.spawn(video_learner_rank, args=(2, str(tmp_path), settings), nprocs=2)
-    ranks = [torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in (0, 1)]
-    assert_equal(ranks[0]["weights"], ranks[1]["weights"])
-    for name, tensor in weights(one.model).items():
-        assert_close(ranks[0]["weights"][name], tensor, rtol=1e-4, atol=1e-6, msg=lambda m, n=name: f"{n}: {m}")
-    numbers = [[u.objective, u.kl, u.ratio_mean, u.clip_low_share, u.clip_high_share] for u in report.updates]
-    assert_close(ranks[0]["numbers"], torch.tensor(numbers), rtol=1e-3, atol=1e-6)
 
 
 # KL modes and anchors

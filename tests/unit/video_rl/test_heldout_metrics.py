@@ -53,7 +53,7 @@ def test_every_metric_of_a_clip_is_a_number_and_the_other_reader_looks_at_the_la
     scene = filmed_scene("push_cube", simulation, 64)
     by = Yardstick(probe, reader, simulation, scene, FaultLimits(0.15, 6), np.eye(4, 3))
     found = measure_clips(frames, probe.read(frames), clips, by, 1)
-    assert {"success", "ghost_motion", "object_permanence", "reader_success"} <= found.keys()
+    assert {"success", "impossible_tool_steps", "object_permanence", "reader_success"} <= found.keys()
     for values in found.values():
         assert values.shape == (3,) and values.dtype == torch.float64 and torch.isfinite(values).all()
     np.testing.assert_array_equal(found["reader_success"], reader.done(frames[:, -1]))

@@ -58,7 +58,7 @@ SMALL = {
     "evaluation.contexts": 2, "evaluation.every": 1, "rewards": {"psnr_db": 1.0, "tracking": 1.0},
 }
 """The preset gpu at a size for tests."""
-NFT = {"grpo.objective": "nft", "grpo.kl.anchor": "frozen"}
+NFT = {"grpo.objective": "nft", "grpo.kl.beta": 0.0}
 Found = dict[str, Tensor]
 
 
@@ -139,7 +139,7 @@ def test_the_toy_is_sampled_scored_trained_saved_and_evaluated_alike(
         again = learner_of(ToyContexts(load_base(device=where), config))
         again.load(path)
         assert again.iterations == 2
-        found |= {name: value.cpu() for name, value in source.evaluate(draw_scenes(3, 0, "evaluation")).named().items()}
+        found |= {name: value.cpu() for name, value in source.evaluate(draw_scenes(3, 0, "evaluation")).items()}
         following = [source.score(request, source.sample(request)) for request in [source.request(2, learner.version)]]
         for one in (learner, again):
             one.train(following[0])

@@ -115,19 +115,19 @@ def test_four_in_ten_training_discs_obey_and_a_quarter_of_the_others_happens_to(
 def test_a_disc_that_obeys_scores_highest_in_every_respect() -> None:
     some = scenes()
     found = score(some.videos(some.action), some)
-    assert float(found.task.min()) > 0.8 and float(found.task.mean()) > 0.9
-    assert found.obeyed.tolist() == [1.0] * 64
-    assert_close(found.mass, torch.ones(64, dtype=torch.float64), atol=0.15, rtol=0)
-    assert float(found.background.max()) < 1e-3
-    assert float(found.reward.min()) > 1.0
+    assert float(found["task"].min()) > 0.8 and float(found["task"].mean()) > 0.9
+    assert found["obeyed"].tolist() == [1.0] * 64
+    assert_close(found["mass"], torch.ones(64, dtype=torch.float64), atol=0.15, rtol=0)
+    assert float(found["background"].max()) < 1e-3
+    assert float(found["reward"].min()) > 1.0
 
 
 @pytest.mark.parametrize("by", [1, 2, 3])
 def test_a_disc_that_goes_another_way_has_not_obeyed(by: int) -> None:
     some = scenes()
     right, wrong = score(some.videos(some.action), some), score(turned(some, by), some)
-    assert not wrong.obeyed.any() and bool((wrong.task < right.task - 0.2).all())
-    assert bool((wrong.background < 2e-3).all()), "its wrong way is no error of the background"
+    assert not wrong["obeyed"].any() and bool((wrong["task"] < right["task"] - 0.2).all())
+    assert bool((wrong["background"] < 2e-3).all()), "its wrong way is no error of the background"
 
 
 def test_the_task_score_of_a_known_path_error_is_the_one_worked_by_hand() -> None:
@@ -135,9 +135,9 @@ def test_the_task_score_of_a_known_path_error_is_the_one_worked_by_hand() -> Non
     commanded = scene(0)
     still = commanded.videos(torch.tensor([0]))[:, :, :1].repeat(1, 1, FRAMES, 1, 1)
     found = score(still, commanded)
-    assert float(found.task) == pytest.approx(sum(math.exp(-e / 2) for e in range(1, 6)) / 5, abs=1e-4)
-    assert float(found.mass) == pytest.approx(1.0) and float(found.obeyed) == 0.0
-    assert float(found.reward) == pytest.approx(float(found.task) + 0.3, abs=1e-4)
+    assert float(found["task"]) == pytest.approx(sum(math.exp(-e / 2) for e in range(1, 6)) / 5, abs=1e-4)
+    assert float(found["mass"]) == pytest.approx(1.0) and float(found["obeyed"]) == 0.0
+    assert float(found["reward"]) == pytest.approx(float(found["task"]) + 0.3, abs=1e-4)
 
 
 def test_a_disc_of_half_the_opacity_has_less_mass_and_one_that_is_gone_none() -> None:
@@ -146,9 +146,10 @@ def test_a_disc_of_half_the_opacity_has_less_mass_and_one_that_is_gone_none() ->
     faint, gone = video.clone(), video.clone()
     faint[:, :, 1:] *= 0.5
     gone[:, :, 1:] = 0
-    assert 0.3 < float(score(faint, commanded).mass) < 0.55
+    assert 0.3 < float(score(faint, commanded)["mass"]) < 0.55
     lost = score(gone, commanded)
-    assert float(lost.mass) == 0 and float(lost.obeyed) == 0 and float(lost.task) == pytest.approx(math.exp(-8))
+    assert float(lost["mass"]) == 0 and float(lost["obeyed"]) == 0
+    assert float(lost["task"]) == pytest.approx(math.exp(-8))
 
 
 def test_a_disc_that_grows_has_more_mass_than_one_and_is_paid_for_one() -> None:
@@ -157,12 +158,12 @@ def test_a_disc_that_grows_has_more_mass_than_one_and_is_paid_for_one() -> None:
     grown = COLOUR.view(1, 2, 1, 1, 1) * alpha
     grown[:, :, 0] = commanded.videos(commanded.action)[:, :, 0]
     found = score(grown, commanded)
-    assert float(found.mass) > 1.2
-    assert float(found.reward) == float(found.task + 0.3 - 10 * found.background)
+    assert float(found["mass"]) > 1.2
+    assert float(found["reward"]) == float(found["task"] + 0.3 - 10 * found["background"])
     grown[:, :, 1:] *= 0.5
     faint = score(grown, commanded)
-    assert float(faint.mass) < 1
-    assert float(faint.reward) == float(faint.task + 0.3 * faint.mass - 10 * faint.background)
+    assert float(faint["mass"]) < 1
+    assert float(faint["reward"]) == float(faint["task"] + 0.3 * faint["mass"] - 10 * faint["background"])
 
 
 def test_a_changed_background_costs_its_mean_square_and_nothing_else() -> None:
@@ -171,27 +172,27 @@ def test_a_changed_background_costs_its_mean_square_and_nothing_else() -> None:
     tinted = video.clone()
     tinted[:, :, 1:] += 0.1
     found = score(tinted, commanded)
-    assert float(found.background) == pytest.approx(0.01, rel=0.01)
-    assert float(found.task) == pytest.approx(float(score(video, commanded).task), abs=0.05)
-    before = score(video, commanded).background
+    assert float(found["background"]) == pytest.approx(0.01, rel=0.01)
+    assert float(found["task"]) == pytest.approx(float(score(video, commanded)["task"]), abs=0.05)
+    before = score(video, commanded)["background"]
     video[:, :, 0] += 0.1
-    assert torch.equal(score(video, commanded).background, before), "the given frame is not scored"
+    assert torch.equal(score(video, commanded)["background"], before), "the given frame is not scored"
 
 
 def test_a_video_that_is_not_finite_gets_a_reward_that_is_not_finite_so_that_it_is_left_out() -> None:
     commanded = scene(0)
     broken = commanded.videos(torch.tensor([0]))
     broken[:, :, 3] = math.nan
-    assert not math.isfinite(float(score(broken, commanded).reward))
+    assert not math.isfinite(float(score(broken, commanded)["reward"]))
 
 
 def test_every_video_is_scored_by_itself() -> None:
     some = scenes(6)
     videos = some.videos(some.action) + 0.05 * randn(6, CHANNELS, FRAMES, SIDE, SIDE)
-    together = score(videos, some).reward
+    together = score(videos, some)["reward"]
     for i in range(6):
         one = Scenes(some.background[i : i + 1], some.start[i : i + 1], some.speed[i : i + 1], some.action[i : i + 1])
-        assert float(score(videos[i : i + 1], one).reward) == pytest.approx(float(together[i]), abs=1e-6)
+        assert float(score(videos[i : i + 1], one)["reward"]) == pytest.approx(float(together[i]), abs=1e-6)
 
 
 def test_the_same_scenes_in_more_pixels_look_and_score_the_same() -> None:
@@ -201,17 +202,17 @@ def test_the_same_scenes_in_more_pixels_look_and_score_the_same() -> None:
     assert_close(fine.path(fine.action) - 23 / 2, 1.5 * (coarse.path(coarse.action) - 15 / 2), atol=1e-4, rtol=0)
     for by in (0, 1, 2, 3):
         a, b = score(turned(fine, by), fine), score(turned(coarse, by), coarse)
-        assert torch.equal(a.obeyed, b.obeyed)
-        assert_close(a.task, b.task, atol=0.05, rtol=0)
-        assert_close(a.mass, b.mass, atol=0.1, rtol=0)
+        assert torch.equal(a["obeyed"], b["obeyed"])
+        assert_close(a["task"], b["task"], atol=0.05, rtol=0)
+        assert_close(a["mass"], b["mass"], atol=0.1, rtol=0)
 
 
 def test_a_picture_that_stands_still_is_most_consistent_and_obeys_nobody() -> None:
     some = scenes(16)
     still = some.videos(some.action)[:, :, :1].repeat(1, 1, FRAMES, 1, 1)
     frozen, moving = score(still, some), score(some.videos(some.action), some)
-    assert frozen.consistency.tolist() == [1.0] * 16 and not frozen.obeyed.any()
-    assert bool((moving.consistency < 0.6).all())
+    assert frozen["consistency"].tolist() == [1.0] * 16 and not frozen["obeyed"].any()
+    assert bool((moving["consistency"] < 0.6).all())
     jump = still.clone()
     jump[:, :, 3:] += 0.1
-    assert_close(score(jump, some).consistency, torch.full((16,), math.exp(-0.01 / 5 / 0.02), dtype=torch.float64))
+    assert_close(score(jump, some)["consistency"], torch.full((16,), math.exp(-0.01 / 5 / 0.02), dtype=torch.float64))

@@ -41,8 +41,8 @@ def test_a_group_of_the_toy_is_several_videos_of_one_scene_scored_from_their_pix
     buffer = source.score(request, source.sample(request))
     assert buffer.group_ids.tolist() == [0, 0, 0, 1, 1, 1] and buffer.sample_ids.tolist() == [0, 1, 2, 0, 1, 2]
     scenes = draw_scenes(2, CONFIG.seed, "rollouts", 3).rows(buffer.group_ids)
-    assert torch.equal(buffer.rewards["total"], score(buffer.rollout.latents, scenes).reward)
-    assert torch.equal(buffer.rewards["obeyed"], score(buffer.rollout.latents, scenes).obeyed)
+    assert torch.equal(buffer.rewards["total"], score(buffer.rollout.latents, scenes)["reward"])
+    assert torch.equal(buffer.rewards["obeyed"], score(buffer.rollout.latents, scenes)["obeyed"])
     assert not torch.equal(buffer.rollout.latents[0], buffer.rollout.latents[1])
 
 

@@ -15,7 +15,6 @@ from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.training.metrics import read_metrics
 from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model import VideoNetwork
-from wm_nodes.video_rl.reference_reward import more_is_better
 from wm_nodes.video_rl.reward_hacking import WATCHED, alarm_text, hacked_slopes, hacking_alarms
 from wm_nodes.video_rl.training_run import VIDEO_FILES, VideoRun, progress
 
@@ -68,13 +67,6 @@ def test_only_the_newest_evaluations_count() -> None:
     rewards = [0.5, 0.4, 0.3, 0.4, 0.5, 0.6]
     assert hacking_alarms(lines(rewards, tracking=[0.9, 0.5, 0.1, 0.2, 0.3, 0.4]), window=4) == {"hacked": 0.0}
     assert hacking_alarms(lines(rewards, tracking=[0.1, 0.2, 0.9, 0.8, 0.7, 0.6]), window=4)["hacked"] == 1.0
-
-
-def test_the_object_that_moves_too_far_is_as_wrong_as_the_one_that_stays() -> None:
-    assert more_is_better("motion", [0.5, 1.0, 1.5]).tolist() == [-0.5, 0.0, -0.5]
-    assert hacked_slopes(hacking_alarms(lines([1, 2, 3], motion=[1.0, 1.2, 1.4]), window=3)) == {
-        "motion": pytest.approx(-0.2)
-    }
 
 
 def test_the_reward_of_an_evaluation_is_the_mean_over_the_buffers_since_the_one_before() -> None:
@@ -130,7 +122,7 @@ def test_held_out_scores_are_written_every_so_many_buffers_and_the_alarm_with_th
     assert written(read_metrics(tmp_path, "grpo")[0], SCORES) == documented("section `grpo`")
 
 
-def test_raw_rewards_and_the_noise_of_each_step_are_in_the_log(tmp_path: Path, network: VideoNetwork) -> None:
+def test_raw_rewards_and_the_noise_are_in_the_log(tmp_path: Path, network: VideoNetwork) -> None:
     run = VideoRun(network, config(every=0), tmp_path)
     buffer = toy_buffer(network, ROLLOUT)
     raw = {"total": torch.arange(8.0), "tracking": torch.arange(8.0), "object_cm": 10 * torch.arange(8.0)}
@@ -140,9 +132,8 @@ def test_raw_rewards_and_the_noise_of_each_step_are_in_the_log(tmp_path: Path, n
     run.close()
     (line,) = read_metrics(tmp_path, "grpo")
     assert (line["reward_mean"], line["reward_tracking"], line["reward_object_cm"]) == (3.5, 3.5, 30.0)
-    shares = [float(str(line[f"noise_share_step_{k}"])) for k in range(5)]
-    assert shares == pytest.approx(buffer.rollout.noise_share.tolist()) and len(set(shares)) > 1
-    assert line["noise_share"] == pytest.approx(math.sqrt(sum(share**2 for share in shares) / 5))
+    shares = buffer.rollout.noise_share.tolist()
+    assert line["noise_share"] == pytest.approx(math.sqrt(sum(share**2 for share in shares) / 5)) and len(shares) == 5
 
 
 def test_without_an_evaluation_setting_nothing_is_asked(tmp_path: Path, network: VideoNetwork) -> None:

@@ -103,7 +103,7 @@ class ClosedLoopSource(RecordedSource):
         is smaller than at the first call, 0.5 where it is the same."""
         frames = sample_by_ode(self.folder, self._heldout, self.config, self.config.evaluation.num_steps)
         found = score_clips(frames, self._heldout, self.probe, self.folder.clip["num_conditioning"])
-        scores = {name: getattr(found, name) for name in SCORES}
+        scores = {name: found[name] for name in SCORES}
         scores["error_cm"] = scores["object_cm"] + scores["tool_cm"]
         if self._before is None:
             self._before = scores["error_cm"]

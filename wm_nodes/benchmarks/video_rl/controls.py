@@ -67,7 +67,6 @@ class FlowMatchingLearner:
                 name: float(values[torch.isfinite(values)].mean())
                 for name, values in buffer.rewards.items() if name != "total"
             },
-            step_noise={},
         )
 
     def _update(self, buffer: RolloutBuffer, rows: Tensor) -> UpdateReport:

@@ -46,7 +46,7 @@ MARGIN_PX = 4
 BATCH = 64
 """Pictures per call of a tokenizer."""
 SPREADS = ("diversity", "diversity_dynamic", "object_spread_cm", "reward_std")
-SCORES = ("tracking", "scenery", "object_cm", "motion")
+SCORES = ("tracking", "scenery", "object_cm")
 
 
 @dataclass(kw_only=True)

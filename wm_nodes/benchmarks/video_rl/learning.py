@@ -51,7 +51,7 @@ def train_sampler(
     if len(buffers) % plan.eval_every:
         after = source.validate()
         evaluations.append({"iteration": len(buffers), **_means(after)})
-    names = dict.fromkeys(name for row in buffers for name in row)  # a window's steps are not those of every buffer
+    names = dict.fromkeys(name for row in buffers for name in row)  # a buffer that is skipped has no updates
     return {
         "sampler": sampler.name, "shared_noise": sampler.shared_noise, "seed": seed, "plan": asdict(plan),
         "before": before, "after": after, "evaluations": evaluations,

@@ -52,8 +52,7 @@ from wm_nodes.world_model.position_probe import PositionProbe
 MEASURES = ("success_path", "success", "outcome", "scenery")
 SCORES = ("success", "outcome", "scenery")
 METRICS = (
-    "success", "reader_success", "executed_success", "executed_object_cm", "object_permanence", "ghost_motion",
-    "impossible_tool_steps", "scenery_change",
+    "success", "reader_success", "executed_success", "executed_object_cm", "object_permanence", "impossible_tool_steps",
 )
 MEASURED = 100
 
@@ -94,7 +93,7 @@ class OutcomeSource(JudgedContexts):
     def validate(self) -> Mapping[str, list[float]]:
         self.folder.network.eval()
         frames = sample_by_ode(self.folder, self._heldout, self.config, self.config.evaluation.num_steps)
-        scores = score_clips(frames, self._heldout, self.probe, self.folder.clip["num_conditioning"]).named()
+        scores = score_clips(frames, self._heldout, self.probe, self.folder.clip["num_conditioning"])
         return {name: scores[name].tolist() for name in SCORES}
 
 

@@ -124,7 +124,7 @@ def size_rows(
     return [
         {"side_px": frames.shape[2], "shown": name, **{measure: values.tolist() for measure, values in scores.items()}}
         for name, clips in shown.items()
-        for scores in [score_clips(clips, contexts, probe, folder.clip["num_conditioning"]).named()]
+        for scores in [score_clips(clips, contexts, probe, folder.clip["num_conditioning"])]
     ]
 
 

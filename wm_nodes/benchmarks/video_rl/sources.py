@@ -59,7 +59,7 @@ class DiscSource(ToyContexts):
         return {**group_spread(buffer, self.config.groups.group_size), "advantage_max": largest}
 
     def validate(self) -> dict[str, list[float]]:
-        return {name: values.tolist() for name, values in self.evaluate(self._heldout).named().items()}
+        return {name: values.tolist() for name, values in self.evaluate(self._heldout).items()}
 
 
 class RecordedSource(RecordedContexts):

@@ -1,4 +1,4 @@
-"""Check a video model before GRPO trains it: ratio, KL, ODE step, mask and buffer, a line each; of an embedded
+"""Check a video model before GRPO trains it: sampled videos, ratio, KL and mask, a line each; of an embedded
 one what the best clip of a group is better by than the others, clip after clip on its own frames: where that closes
 little of the gap to the codec, no group method can learn.
 
@@ -45,7 +45,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", type=_size, default=(480, 832), metavar="HxW", help="pixels; default 480x832")
     parser.add_argument("--frames", type=int, default=9, help="frames of a clip; 4 n + 1 for Wan's VAE")
     parser.add_argument("--dtype", choices=("float32", "bfloat16", "float16"), default="float32")
-    parser.add_argument("--offload", action="store_true", help="VAE and text encoder rest on the CPU")
     parser.add_argument("--lora-rank", type=int, default=0, help="check with a LoRA adapter of this rank")
     parser.add_argument("--contexts", type=positive, default=32, help="contexts whose groups show the head-room")
     add_preset(parser, "recommended", VIDEO)
@@ -122,7 +121,7 @@ def _model_to_check(
 def _public(arguments: argparse.Namespace, config: VideoRlConfig, device: str) -> ModelToCheck:
     from wm_nodes.video_model.adapters import add_lora, load_public_model
 
-    public = load_public_model(arguments.public, dtype=arguments.dtype, device=device, offload=arguments.offload)
+    public = load_public_model(arguments.public, dtype=arguments.dtype, device=device)
     frames = torch.from_numpy(np.stack([_picture(arguments)] * arguments.frames))[None]
     C, F, H, W = public.codec.encode(frames).shape[1:]
     condition = public.condition(frames[:, :1], [arguments.prompt], F).repeat_interleave(VIDEOS)

@@ -163,8 +163,8 @@ def _clips(arguments: argparse.Namespace, run_dir: Path) -> Outcome:
     words = "every score is the recorded one, bit for bit" if equal else "scores differ from the bag's"
     if not all(row.same_reward for row in rows):
         words += "; the total is by other rewards than recorded, so it is not compared"
-    if silent := sum(row.recorded.audit_ids.count("") for row in rows if row.verdicts):
-        words += f"; {silent} clips that got no answer then are not compared"
+    if silent := sum(row.unanswered for row in rows):
+        words += f"; {silent} clips that got no reward then are not compared"
     return Outcome(equal, [_table(rows), words], {"rewards": config.rewards, "buffers": [_row(row) for row in rows]})
 
 

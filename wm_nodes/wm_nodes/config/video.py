@@ -171,7 +171,7 @@ class AdvantageConfig(SettingsSection):
 
 class KlConfig(SettingsSection):
     mode: Literal["mean", "logk2"]
-    """mean: DD-17, of the means of a step; logk2: of log-probabilities (DD-17a). With objective nft: of velocities."""
+    """mean: DD-17, of the means of a step; logk2: of log-probabilities (DD-17a)."""
     beta: NonNegativeFloat
     """Weight; 0: no KL."""
     anchor: Anchor
@@ -222,13 +222,9 @@ class GrpoConfig(SettingsSection):
     """A longer gradient is scaled to it."""
 
     @model_validator(mode="after")
-    def _nft_has_no_transition(self) -> Self:
-        """DiffusionNFT knows clips and velocities alone: no buffer of step noise, no likelihood."""
-        if self.objective == "nft" and self.kl.beta and self.kl.anchor in ("buffer", "dual"):
-            raise ValueError(
-                f"objective nft has no transitions, got kl.beta {self.kl.beta} with kl.anchor {self.kl.anchor}; take "
-                "kl.beta 0, or kl.anchor frozen or lora_off"
-            )
+    def _nft_has_no_kl(self) -> Self:
+        if self.objective == "nft" and self.kl.beta:
+            raise ValueError(f"objective nft has no KL, got kl.beta {self.kl.beta}; set kl.beta 0")
         return self
 
 

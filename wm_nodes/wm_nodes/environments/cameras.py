@@ -20,8 +20,9 @@ def simulated_cameras(config: SimulationConfig, state_of: Callable[[int], FloatA
     return table_top_cameras(config, lambda env: hand_over(state_of(env)))
 
 
-def still_cameras(config: SimulationConfig, size: int) -> list[tuple[int, CameraModel]]:
-    """The cameras that do not move, for pictures `size` px high, and which view of a frame is theirs.
+def still_camera(config: SimulationConfig, size: int) -> tuple[int, CameraModel]:
+    """Which view of a frame is that of the first camera that does not move, and that camera, for pictures `size` px
+    high.
 
     Raises:
         ValueError: all of them move.
@@ -30,4 +31,4 @@ def still_cameras(config: SimulationConfig, size: int) -> list[tuple[int, Camera
     still = [(index, camera) for index, camera in enumerate(cameras) if not camera.moves]
     if not still:
         raise ValueError(f"cameras {config.cameras} all move; faults are read in a still one, such as side")
-    return still
+    return still[0]

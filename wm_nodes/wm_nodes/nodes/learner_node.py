@@ -1,5 +1,7 @@
 """learner: asks the policy for rollouts, joins what the graph publishes about them, trains, announces new versions."""
 
+import os
+import signal
 import sys
 import time
 import zlib
@@ -30,7 +32,7 @@ from wm_nodes.nodes.learner.meter import LearnerMeter
 from wm_nodes.nodes.learner.report import LearnerReport
 from wm_nodes.nodes.learner.rollout_assembler import RolloutAssembler
 from wm_nodes.nodes.learner.rollout_sources import BagRollouts, LiveRollouts, ReplayedRollouts, RolloutSource, bag_paths
-from wm_nodes.nodes.learner.training_node import TrainingNode, run_learner
+from wm_nodes.nodes.learner.training_node import TrainingNode
 from wm_nodes.nodes.policy.weights import load_initial
 from wm_nodes.policy_rl.factories import make_learner
 from wm_nodes.policy_rl.rollouts import Canceled, TensorRollout
@@ -40,10 +42,11 @@ from wm_nodes.recording.reader import read_spec
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import GuardedActionClient
-from wm_nodes.ros.params import COMMON, Param, named_files
+from wm_nodes.ros.params import COMMON, Param, named_files, read_parameters
 from wm_nodes.ros.sequence_numbers import check_session
+from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.worker import Work
-from wm_nodes.training.ranks import Ranks, own_device
+from wm_nodes.training.ranks import Ranks, join, own_device
 from wm_nodes.training.weights import INLINE_LIMIT_BYTES
 
 MAX_CHUNK_BYTES = 4 << 20
@@ -72,6 +75,7 @@ class LearnerNode(TrainingNode):
     """Action train; services learner/save, learner/get_weights; publishes policy/version, learner/metrics.
 
     Args:
+        ranks: this process is rank 0 of them.
         local_environment: in a composed process, returns what the environment node serves; live rollouts are then made
             here, on the device.
     """
@@ -82,7 +86,8 @@ class LearnerNode(TrainingNode):
         self, ranks: Ranks | None = None, local_environment: Callable[[], Environment | None] | None = None,
         **node_arguments: Any,
     ) -> None:
-        super().__init__(PARAMS, ranks, **node_arguments)
+        super().__init__(PARAMS, **node_arguments)
+        self._ranks = ranks or Ranks()
         self._device_rollouts = None if local_environment is None else DeviceRollouts(local_environment)
 
     def configure(self) -> None:
@@ -90,7 +95,7 @@ class LearnerNode(TrainingNode):
         self._config = self.run_config()
         values = {param.name: self.param(param.name) for param in (*COMMON, *PARAMS)}
         self._files: NamedFiles = named_files(self, str(self.param("replay_at_start")))
-        self._training = make_run(values, self.run_dir, self.ranks)
+        self._training = make_run(values, self.run_dir, self._ranks)
         self._report = LearnerReport(self, tensorboard=bool(self.param("tensorboard")))
         self.own(self._report.close)
         self._meter = LearnerMeter(self, self._config, self._training, self._report)
@@ -360,7 +365,16 @@ def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> PolicyTr
 
 
 def main() -> int:
-    return run_learner(LearnerNode, PARAMS, make_run, lambda file: load_config(file).device)
+    """One process, or under torchrun rank 0 as the node and the other ranks behind it; return the exit code."""
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return run_node(LearnerNode)
+    values = read_parameters("learner", (*COMMON, *PARAMS))
+    ranks = join(load_config(str(values["config_file"])).device)
+    if ranks.rank == 0:
+        return run_node(lambda: LearnerNode(ranks))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # rank 0 ends the others
+    make_run(values, Path(str(values["run_dir"])), ranks).follow()
+    return 0
 
 
 if __name__ == "__main__":

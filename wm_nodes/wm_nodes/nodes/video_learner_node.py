@@ -1,6 +1,7 @@
 """learner of loop 2: asks for clips and their scores, trains the video model by GRPO, announces new versions."""
 
 import math
+import os
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -12,17 +13,18 @@ import torch
 from wm_msgs.action import EvaluateClips, GenerateClips, TrainVideo
 from wm_msgs.msg import ClipScores
 from wm_nodes.config.load import load_video_config
+from wm_nodes.core.device import compute_device
 from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.nodes.clip_evaluator_node import read_buffer
-from wm_nodes.nodes.learner.training_node import TrainingNode, run_learner
+from wm_nodes.nodes.learner.training_node import TrainingNode
 from wm_nodes.ros import diagnostics
 from wm_nodes.ros.actions import GuardedActionClient
 from wm_nodes.ros.clients import run_goal, same_process
 from wm_nodes.ros.endpoint_matching import StartBarrier
 from wm_nodes.ros.params import COMMON, Param, named_files
+from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import PeerLost
 from wm_nodes.ros.worker import Work
-from wm_nodes.training.ranks import Ranks, own_device
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import BufferReport
@@ -50,15 +52,22 @@ PARAMS = (
 
 
 class VideoLearnerNode(TrainingNode):
-    """Action video/train; calls video/generate and clips/evaluate; publishes video/version."""
+    """Action video/train; calls video/generate and clips/evaluate; publishes video/version.
 
-    def __init__(self, ranks: Ranks | None = None, **node_arguments: Any) -> None:
-        super().__init__(PARAMS, ranks, **node_arguments)
+    Raises:
+        ValueError: torchrun began several processes.
+    """
+
+    def __init__(self, **node_arguments: Any) -> None:
+        ranks = int(os.environ.get("WORLD_SIZE", "1"))
+        if ranks > 1:
+            raise ValueError(f"this learner is one process, got WORLD_SIZE {ranks}; start it without torchrun")
+        super().__init__(PARAMS, **node_arguments)
 
     def configure(self) -> None:
         self.hold_run_folder()
         values = {param.name: self.param(param.name) for param in (*COMMON, *PARAMS)}
-        self._video = make_run(values, self.run_dir, self.ranks)
+        self._video = make_run(values, self.run_dir)
         self.own(self._video.close)
         self._watched, self.files = self._video.alarms, named_files(self)
         self._start_barrier = StartBarrier(self, self.links.table)
@@ -193,21 +202,21 @@ def with_scores(buffer: RolloutBuffer, scores: ClipScores) -> RolloutBuffer:
     return buffer.with_rewards({**rewards, "total": torch.where(valid > 0, total, torch.nan)})
 
 
-def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> VideoRun:
+def make_run(values: Mapping[str, Any], run_dir: Path) -> VideoRun:
     """The run that a node's parameters describe."""
     config = load_video_config(str(values["config_file"]))
-    folder = load_video_folder(Path(str(values["video_model_dir"])), own_device(config.device))
+    folder = load_video_folder(Path(str(values["video_model_dir"])), compute_device(config.device))
     bags = [Path(text) for text in values["heldout_bags"] if text]
-    watched = bool(bags) and config.evaluation.every > 0 and ranks.rank == 0
+    watched = bool(bags) and config.evaluation.every > 0
     return VideoRun(
         folder.network, config, run_dir, keep_versions=int(values["keep_versions"]),
-        tensorboard=bool(values["tensorboard"]), ranks=ranks,
+        tensorboard=bool(values["tensorboard"]),
         heldout=validation_scores(folder, bags, Path(str(values["model_dir"])), config) if watched else None,
     )
 
 
 def main() -> int:
-    return run_learner(VideoLearnerNode, PARAMS, make_run, lambda file: load_video_config(file).device)
+    return run_node(VideoLearnerNode)
 
 
 if __name__ == "__main__":

@@ -65,6 +65,7 @@ class PolicyTraining(TrainingRun):
 
     Args:
         resume: continue from the newest checkpoint of the run folder, where there is one.
+        ranks: this process's place; rank 0 writes the files, the others follow() it.
     """
 
     files, checkpoint = POLICY_FILES, "checkpoints/learner.json"
@@ -73,7 +74,8 @@ class PolicyTraining(TrainingRun):
         self, policy: ImagePolicy, learner: Learner, run_dir: Path, *, resume: bool, keep_versions: int,
         metadata: Mapping[str, str], ranks: Ranks | None = None,
     ) -> None:
-        super().__init__(run_dir, keep_versions, ranks)
+        super().__init__(run_dir, keep_versions)
+        self.ranks = ranks or Ranks()
         self.policy, self.learner, self._metadata = policy, learner, dict(metadata)
         self.progress = Progress()
         if self.ranks.rank:
@@ -135,6 +137,7 @@ class PolicyTraining(TrainingRun):
         return metrics | {"update_s": seconds} | counts
 
     def follow(self) -> None:
+        """Be a rank other than 0: make rank 0's updates until it closes."""
         while (rollout := broadcast_rollout(None, self.ranks)) is not None:
             with suppress(Canceled, ValueError, FloatingPointError):  # rank 0 has raised and reported the same
                 self.learner.update(rollout)

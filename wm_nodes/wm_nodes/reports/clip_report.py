@@ -13,7 +13,7 @@ from wm_nodes.reports.html import MARK, Picture, write_page
 
 TITLES = {
     "tracking": "tracking score", "object_cm": "object error, cm", "tool_cm": "tool error, cm", "psnr_db": "PSNR, dB",
-    "scenery": "scenery error", "motion": "motion share", "success": "task done at the end", "outcome": "outcome score",
+    "scenery": "scenery error", "success": "task done at the end", "outcome": "outcome score",
     "ssim": "SSIM", "perceptual": "perceptual score", "closeness": "closeness of pictures",
     "execution": "done signal of the action world model", "execution_success": "task done in the action world model",
 }
@@ -21,8 +21,7 @@ TITLES = {
 UNREWARDED_TITLES = {
     "executed_success": "executed: task done", "executed_object_cm": "executed: object elsewhere, cm",
     "reader_success": "task done, other reader", "object_permanence": "object still seen (share)",
-    "impossible_tool_steps": "impossible tool steps (share)", "ghost_motion": "object moves untouched (share)",
-    "scenery_change": "scenery change",
+    "impossible_tool_steps": "impossible tool steps (share)",
 }
 """The same of metrics that no reward can weigh."""
 ALL_TITLES = TITLES | UNREWARDED_TITLES

@@ -97,7 +97,7 @@ def broadcast_rollout(rollout: Rollout | None, ranks: Ranks) -> Rollout | None:
     if ranks.rank == 0 and rollout is not None:
         arrays = {f.name: getattr(rollout, f.name) for f in fields(rollout) if f.name != "policy_version"}
         layout = [rollout.policy_version, {name: (a.shape, str(a.dtype)) for name, a in arrays.items()}]
-    text = broadcast_bytes(None if layout is None else json.dumps(layout).encode(), ranks)
+    text = _broadcast_bytes(None if layout is None else json.dumps(layout).encode(), ranks)
     if text is None:
         return None
     version, shapes = json.loads(text)
@@ -110,7 +110,7 @@ def broadcast_rollout(rollout: Rollout | None, ranks: Ranks) -> Rollout | None:
     return Rollout(policy_version=version, **received)
 
 
-def broadcast_bytes(data: bytes | None, ranks: Ranks) -> bytes | None:
+def _broadcast_bytes(data: bytes | None, ranks: Ranks) -> bytes | None:
     """Rank 0 gives its bytes to all ranks; None from rank 0 means that there are no more."""
     if ranks.size == 1:
         return data

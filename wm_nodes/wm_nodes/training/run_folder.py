@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from wm_nodes.core.named_files import WEIGHTS, read_regular
-from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import PackedWeights, unpack_weights
 
 
@@ -41,16 +40,14 @@ class TrainingRun(ABC):
 
     Args:
         keep_versions: weights files kept; older ones are deleted.
-        ranks: this process's place; rank 0 writes the files, the others follow() it.
     """
 
     files: VersionFiles
     checkpoint: str
     """File name of the checkpoint, relative to the run folder."""
 
-    def __init__(self, run_dir: Path, keep_versions: int, ranks: Ranks | None) -> None:
-        self.run_dir, self.ranks = run_dir, ranks or Ranks()
-        self._keep_versions = keep_versions
+    def __init__(self, run_dir: Path, keep_versions: int) -> None:
+        self.run_dir, self._keep_versions = run_dir, keep_versions
         self._newest: tuple[int, PackedWeights] | None = None
 
     @property
@@ -66,10 +63,6 @@ class TrainingRun(ABC):
     @abstractmethod
     def write_files(self) -> PackedWeights:
         """Write the version's weights and the checkpoint; return the weights. Raises OSError."""
-
-    @abstractmethod
-    def follow(self) -> None:
-        """Be a rank other than 0: make rank 0's updates until it closes."""
 
     @property
     def saved_version(self) -> int:

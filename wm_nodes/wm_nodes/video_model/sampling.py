@@ -1,13 +1,11 @@
 """Sample videos and keep what training needs of them (DD-1, DD-14b).
 
-Shapes: N videos, S stochastic steps, L kept latents, M transitions, C channels, F latent frames, H W grid, K given
-frames, U = C (F - K) H W generated elements.
+Shapes: N videos, S stochastic steps, L kept latents, C channels, F latent frames, H W grid, K given frames.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -180,30 +178,3 @@ def normalised_noise(x_s: Tensor, law: Step, num_conditioning: int) -> Tensor:
     """Return zeta of DD-14b, (x_s - mean) / std on generated frames, (N, C, F - K, H, W)."""
     K = num_conditioning
     return (x_s[:, :, K:] - law.mean[:, :, K:]).div_(law.std[:, :, K:])
-
-
-class GaussianTransition(NamedTuple):
-    """The Gaussian of M stored transitions under the weights of now."""
-
-    zeta: Tensor
-    """(x_s - mean) / std, (M, U), with gradient."""
-    std: Tensor
-    """(M, U), without."""
-
-
-def transition(
-    model: VelocityModel, condition: Condition, x_t: Tensor, x_s: Tensor, t: Tensor, s: Tensor, mask: Tensor,
-    settings: RolloutConfig,
-) -> GaussianTransition:
-    """Return the normalised noise that leads from x_t to x_s under `model` (DD-1).
-
-    Args:
-        x_t, x_s: stored states (M, C, F, H, W). t, s: float64 (M,), s > 0.
-        mask: the one used at rollout (M, 1, F, H, W).
-    """
-    context = StepContext(condition.frames.float(), float(flow_times(settings.num_steps, settings.shift)[1]), mask)
-    x, K = with_conditioning(x_t.float(), context.conditioning), condition.num_conditioning
-    v = guided_velocity(model, x, t, condition, settings.cfg).float()
-    law = step(x, v, t, s, context, settings.sampler)
-    zeta = normalised_noise(x_s.float(), law, K)
-    return GaussianTransition(zeta.flatten(1), law.std[:, :, K:].expand_as(zeta).flatten(1))

@@ -33,7 +33,6 @@ class VideoEpisodes(DeviceEpisodes):
     Args:
         spec, starts, reward: as DeviceEpisodes's; the spec is that of the simulator the model was learned from.
         settings: of the sampler, an ODE.
-        exact: compute in float32 even where bfloat16 is faster.
 
     Raises:
         ValueError: a model that cannot be stepped, or of another task or robot; starts of another picture size.
@@ -43,12 +42,12 @@ class VideoEpisodes(DeviceEpisodes):
 
     def __init__(
         self, folder: VideoFolder, reader: SuccessReader, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray],
-        reward: RewardConfig, settings: VideoEnvironmentConfig, *, num_envs: int, exact: bool = False,
+        reward: RewardConfig, settings: VideoEnvironmentConfig, *, num_envs: int,
     ) -> None:
         check_steppable(folder, spec)
         device = folder.device
         super().__init__(imagined_spec(spec, f"video/{spec.task}", folder.sha256, num_envs), starts, reward, device)
-        self.folder, self._reader, self._exact = folder, reader, exact
+        self.folder, self._reader = folder, reader
         self._rows = ROWS if device.type == "cpu" else num_envs
         self._sampler = load_video_config("base").rollout.with_values(
             num_steps=settings.num_steps, shift=settings.shift, micro_batch=self._rows
@@ -86,7 +85,7 @@ class VideoEpisodes(DeviceEpisodes):
             condition = Condition(frames, acted[rows, -K:], self._text.expand(len(rows), -1, -1))
             x = torch.cat([torch.zeros_like(frames), noise[rows]], 2)
             none = torch.zeros(len(rows), dtype=torch.int64)  # an ODE has no step noise
-            with compute_context(self.device, exact=self._exact):
+            with compute_context(self.device):
                 made = sample_videos(self.folder.network, condition, x, none, self._sampler, []).latents[:, :, -1:]
             pictures = self.folder.codec.decode(made).squeeze(1)
             return made, pictures, self._reader.read(pictures)

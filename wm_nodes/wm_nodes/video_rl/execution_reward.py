@@ -96,14 +96,14 @@ class ExecutionReward:
             frame to frame. threshold: the done signal above which the task counts as done.
 
     Args:
-        models: of the environment of the recordings.
+        models: of the environment of the recordings, see check_execution.
         folder: its codec and clip; its network is not used.
         recordings: of contexts, with simulator state; correction and reach are measured on them.
         probe: reads positions off decoded clips.
 
     Raises:
-        ValueError: clips without a given frame, an arm that is not commanded by positions, recordings without simulator
-            state, or one that does not begin where its state says.
+        ValueError: clips without a given frame, recordings without simulator state, or one that does not begin where
+            its state says.
     """
 
     def __init__(self, models: WorldModels, folder: VideoFolder, recordings: Clips, probe: PositionProbe) -> None:
@@ -111,7 +111,6 @@ class ExecutionReward:
             raise ValueError("the reward execution follows clips from a recorded frame; set model.num_conditioning 1")
         self._models, self._probe, self._stride = models, probe, folder.clip["stride"]
         self._task, self._tool = recordings.task, columns_of(recordings.task, "tool")
-        check_followable(models.spec, recordings)
         places = _commanded_places(recordings, self._tool)
         seen = probe.read(folder.codec.decode(folder.codec.encode(recordings.frames)))[..., self._tool]
         self.correction = fit_tool_correction(seen, places).round(DECIMALS)

@@ -4,7 +4,7 @@ DiffusionNFT (DD-31).
 Shapes: N videos, S stochastic steps, M transitions (video, step) of one network call, U generated elements.
 
 One buffer serves `updates_per_buffer` optimizer steps. Each one accumulates over every kept (video, step) pair, divided
-by their number, so that micro-batches and ranks do not change it. On the first one the ratio is 1 and DD-20 is 0. With
+by their number, so that micro-batches do not change it. On the first one the ratio is 1 and DD-20 is 0. With
 objective nft forward times stand in for the steps.
 
 Everything is computed where the model is; a buffer may lie there or in the host's memory, from where it is moved by
@@ -25,7 +25,6 @@ from torch.nn.utils import clip_grad_norm_
 from wm_nodes.config.video import GrpoConfig, RolloutConfig
 from wm_nodes.core.device import device_of
 from wm_nodes.training import checkpoint
-from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import WeightsError, check_same_layout
 from wm_nodes.video_model.buffer import RolloutBuffer
 from wm_nodes.video_rl.group_advantages import GroupAdvantages, best_of_n, group_advantages
@@ -91,8 +90,6 @@ class BufferReport:
     """Noise budget that was spent, see VideoRollout.spent_noise."""
     raw_rewards: Mapping[str, float]
     """Mean of each score beside the total over the videos that have it, NaN where none has."""
-    step_noise: Mapping[int, float]
-    """noise_share of each stochastic sampler step."""
 
 
 class GrpoLearner:
@@ -100,12 +97,9 @@ class GrpoLearner:
 
     Args:
         seed: of the step selection (stream `step_selection`), and of noise and times (objective nft: stream `nft`).
-        ranks: this process's place among the learner's processes; all hold the whole buffer.
     """
 
-    def __init__(
-        self, model: nn.Module, settings: GrpoConfig, rollout: RolloutConfig, *, seed: int, ranks: Ranks | None = None,
-    ) -> None:
+    def __init__(self, model: nn.Module, settings: GrpoConfig, rollout: RolloutConfig, *, seed: int) -> None:
         if settings.objective == "ratio" and (rollout.sampler.arm == "ode" or rollout.sampler.eta == 0):
             raise ValueError(
                 "an ODE rollout has no likelihood to train on; choose a stochastic arm and eta > 0, or grpo.objective "
@@ -114,7 +108,6 @@ class GrpoLearner:
         if settings.trains == "condition":
             _train_condition(model)
         self.model, self.settings, self.rollout, self.seed = model, settings, rollout, seed
-        self.ranks = ranks or Ranks()
         self.version = 0
         """Optimizer steps made so far: the policy version of the weights."""
         self.iterations = 0
@@ -189,7 +182,6 @@ class GrpoLearner:
                 name: float(values[torch.isfinite(values)].mean())
                 for name, values in buffer.rewards.items() if name != "total"
             },
-            step_noise=dict(zip(buffer.rollout.steps, buffer.rollout.noise_share.tolist(), strict=True)),
         )
 
     def rows(self, buffer: RolloutBuffer, kept_N: Tensor) -> Rows:
@@ -201,16 +193,13 @@ class GrpoLearner:
         device, total = device_of(self.model), len(rows)
         sums = torch.zeros(5, dtype=torch.float64, device=device)
         signals = advantages.advantages_N.to(device, torch.float32)
-        own = self.ranks.share(torch.arange(total))
-        for index in torch.split(own, self.settings.micro_batch):  # type: ignore[no-untyped-call]
+        for index in torch.split(torch.arange(total), self.settings.micro_batch):  # type: ignore[no-untyped-call]
             part = rows.part(index)
             terms = self.terms.compute(buffer, part, signals[part.videos.to(device)], self.version)
             loss = (self.settings.kl.beta * terms.kl - terms.objective).sum() / total
             loss.backward()  # type: ignore[no-untyped-call]
             sums += terms.sums(self.settings.clip)
-        values = sums.cpu()  # the only wait for the device
-        self.ranks.sum_(values)
-        return dict(zip(SUMS, values.tolist(), strict=True))
+        return dict(zip(SUMS, sums.tolist(), strict=True))  # the only wait for the device
 
     # internals
 
@@ -218,7 +207,6 @@ class GrpoLearner:
         self.model.train()
         self._optimizer.zero_grad(set_to_none=True)
         sums = self.gradients(buffer, rows, advantages)
-        self.ranks.sum_gradients(self.model)
         norm = float(clip_grad_norm_(self.parameters, self.settings.max_grad_norm))
         if not math.isfinite(norm):
             raise FloatingPointError(

@@ -14,7 +14,7 @@ from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.config.tasks import get_task
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.types import FloatArray
-from wm_nodes.environments.cameras import ROBOT_BASE, still_cameras
+from wm_nodes.environments.cameras import ROBOT_BASE, still_camera
 from wm_nodes.environments.replay import execute_paths
 from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips
@@ -31,7 +31,6 @@ from wm_nodes.world_model.positions import columns_of, probe_targets
 
 UNREWARDED = (
     "executed_success", "executed_object_cm", "reader_success", "object_permanence", "impossible_tool_steps",
-    "ghost_motion", "scenery_change",
 )
 """What no reward can weigh. executed_success, executed_object_cm: of the clip's tool path in the simulator: whether the
 task is done, and how far the object ends from where the clip shows it. reader_success: whether the other reader sees it
@@ -76,10 +75,10 @@ def make_yardstick(
 
 
 def filmed_scene(task: str, simulation: SimulationConfig, size: int) -> FilmedScene:
-    """What pictures `size` px high show of a task in its simulator. Raises ValueError as still_cameras."""
+    """What pictures `size` px high show of a task in its simulator. Raises ValueError as still_camera."""
     thing, tool = (columns_of(task, name) for name in ("object", "tool"))
     height = get_task(task).judge.object_height_m
-    return FilmedScene(still_cameras(simulation, size), ROBOT_BASE, height, thing, tool)
+    return FilmedScene(*still_camera(simulation, size), ROBOT_BASE, height, thing, tool)
 
 
 @dataclass(frozen=True)
@@ -112,9 +111,8 @@ def load_or_measure_unrewarded(
         return {"before": first, "after": last, "missing": missing}
 
     weights = [pack_weights(model.network).sha256 for model in models]
-    return Unrewarded(
-        **measured_once(path, {"sha256": weights, "evaluation": config.evaluation.model_dump()}, measure)
-    )
+    of = {"sha256": weights, "evaluation": config.evaluation.model_dump(), "names": list(UNREWARDED)}
+    return Unrewarded(**measured_once(path, of, measure))
 
 
 def _measure(
@@ -139,17 +137,16 @@ def _measure(
 def measure_clips(
     frames: Tensor, positions: FloatArray, references: Clips, by: Yardstick, num_conditioning: int
 ) -> dict[str, Tensor]:
-    """Return by name, float64 (N,), all scores of ClipScores and find_faults of decoded clips, uint8 (N, F, H, W, 3),
+    """Return by name, float64 (N,), all scores of score_clips and find_faults of decoded clips, uint8 (N, F, H, W, 3),
     and where there is a reader `reader_success`: 1 where it sees the task done in the last frame.
 
     positions: what the probe reads in the clips, (N, F, P).
     """
-    scores = score_clips(frames, references, by.probe, num_conditioning).named()
-    faults = find_faults(frames, positions, by.limits, by.scene, num_conditioning)
-    if by.reader is None:
-        return {**scores, **faults}
-    read = torch.from_numpy(by.reader.done(frames[:, -1]).astype(np.float64))
-    return {**scores, **faults, "reader_success": read}
+    found = score_clips(frames, references, by.probe, num_conditioning)
+    found |= find_faults(frames, positions, by.limits, by.scene, num_conditioning)
+    if by.reader is not None:
+        found["reader_success"] = torch.from_numpy(by.reader.done(frames[:, -1]).astype(np.float64))
+    return found
 
 
 def measure_executability(

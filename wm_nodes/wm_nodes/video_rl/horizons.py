@@ -74,7 +74,7 @@ def horizon_scores(frames: Tensor, recorded: Clips, probe: PositionProbe, folder
     while first < frames.shape[1]:
         count = min(new, frames.shape[1] - first)
         part = recorded.window(first - 1, count + 1)
-        scores = score_clips(frames[:, first - 1 : first + count], part, probe, 1).named()
+        scores = score_clips(frames[:, first - 1 : first + count], part, probe, 1)
         found |= {f"{name}_{clip}": scores[name] for name in DRIFT}
         first, clip = first + count, clip + 1
     return found

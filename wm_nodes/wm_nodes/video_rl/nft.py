@@ -22,14 +22,14 @@ from wm_nodes.video_model.buffer import RolloutBuffer
 from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.kernels import with_conditioning
 from wm_nodes.video_model.network import guided_velocity
-from wm_nodes.video_rl.ratio_and_kl import Anchored, LossTerms, Rows
+from wm_nodes.video_rl.ratio_and_kl import LossTerms, Rows, Terms
 
 LEAST_ERROR = 1e-5
 """Below this mean absolute error the adaptive weight no longer grows."""
 
 
-class NftTerms(Anchored):
-    """Objective and KL of noised clips under `model`."""
+class NftTerms(Terms):
+    """Objective of noised clips under `model`."""
 
     def __init__(self, model: nn.Module, settings: GrpoConfig, rollout: RolloutConfig, seed: int) -> None:
         super().__init__(model, settings, rollout, seed)
@@ -43,7 +43,7 @@ class NftTerms(Anchored):
         return torch.ones(len(buffer), self.settings.nft.times, dtype=torch.bool)
 
     def compute(self, buffer: RolloutBuffer, rows: Rows, signals_M: Tensor, version: int) -> LossTerms:
-        """Noise the clips, run the current and the old weights, and return minus the loss of DD-31, and the KL.
+        """Noise the clips, run the current and the old weights, and return minus the loss of DD-31.
 
         signals_M: the advantages. version: optimizer steps made; with the numbers of a row it decides time and noise.
         """
@@ -65,15 +65,7 @@ class NftTerms(Anchored):
         good, bad = (adaptive_error(error) for error in errors)
         share_good = (signals_M / (2 * clip) + 0.5).clamp(0, 1)
         loss = clip * (share_good * good + (1 - share_good) * bad) / nft.beta
-        return LossTerms(-loss, self.kl(v, x_t, t, condition), None)
-
-    def kl(self, v: Tensor, x_t: Tensor, t: Tensor, condition: Condition) -> Tensor:
-        """Return mean over elements of |v - v_anchor|^2 (DD-17a), (M,), of the velocities at x_t."""
-        if not self.settings.kl.beta:
-            return v.new_zeros(len(v))
-        with torch.no_grad(), self.anchored() as model:
-            anchor = self._velocity(model, x_t, t, condition)
-        return (v - anchor).square().mean(1)
+        return LossTerms(-loss, torch.zeros_like(signals_M), None)
 
     # internals
 

@@ -143,8 +143,8 @@ def _score_baselines(
     K = folder.clip["num_conditioning"]
     copied = contexts.frames[:, :1].expand_as(contexts.frames)
     coded = folder.codec.decode(folder.codec.encode(contexts.frames))
-    scores = {f"copy_{name}": float(v.mean()) for name, v in score_clips(copied, contexts, probe, K).named().items()}
-    return scores | {"codec_psnr_db": float(score_clips(coded, contexts, probe, K).psnr_db.mean())}
+    scores = {f"copy_{name}": float(v.mean()) for name, v in score_clips(copied, contexts, probe, K).items()}
+    return scores | {"codec_psnr_db": float(score_clips(coded, contexts, probe, K)["psnr_db"].mean())}
 
 
 def change_std(latents: Tensor, num_conditioning: int, new_frames: int = 0) -> float:

@@ -21,7 +21,9 @@ from torch.func import functional_call
 
 from wm_nodes.config.video import GrpoConfig, RolloutConfig
 from wm_nodes.core.device import device_of
-from wm_nodes.video_model import GaussianTransition, RolloutBuffer, flow_times, select_steps, transition
+from wm_nodes.video_model import RolloutBuffer, StepContext, flow_times, guided_velocity, select_steps, step
+from wm_nodes.video_model.kernels import with_conditioning
+from wm_nodes.video_model.sampling import normalised_noise
 
 
 def log_ratio(new_zeta_MU: Tensor, old_zeta_MU: Tensor, weight_MU: Tensor | float = 1.0) -> Tensor:
@@ -76,13 +78,22 @@ class Rows:
         return stored[index[0], index[1]]
 
 
+class GaussianTransition(NamedTuple):
+    """The Gaussian of M stored transitions under the weights of now."""
+
+    zeta: Tensor
+    """(x_s - mean) / std, (M, U), with gradient."""
+    std: Tensor
+    """(M, U), without."""
+
+
 class LossTerms(NamedTuple):
     """What the loss is made of, (M,), with gradient."""
 
     objective: Tensor
     """To be maximised."""
     kl: Tensor
-    """To the anchor; 0 where it has no weight."""
+    """To the anchor; 0 where it has no weight, and with objective nft."""
     log_ratio: Tensor | None
     """Of DD-15; None with objective nft."""
 
@@ -97,25 +108,14 @@ class LossTerms(NamedTuple):
         return sums
 
 
-class Anchored:
-    """A loss on `model` with weights of an anchor beside it: copies of the parameters that train, nothing else. With
-    LoRA they are as small as the adapter.
-
-    Raises:
-        ValueError: the anchor is a model without its adapter, and there is none.
-    """
+class Terms:
+    """A loss on `model` that may need other weights of it: copies of the parameters that train, nothing else. With LoRA
+    they are as small as the adapter."""
 
     def __init__(self, model: nn.Module, settings: GrpoConfig, rollout: RolloutConfig, seed: int) -> None:
-        if settings.kl.anchor == "lora_off" and not hasattr(model, "disable_adapter"):
-            raise ValueError(
-                "kl.anchor lora_off needs a model with a LoRA adapter; add one (video_model.adapters.add_lora), or "
-                "take kl.anchor frozen"
-            )
         self.model, self.settings, self.rollout, self.seed = model, settings, rollout, seed
         self.anchor: dict[str, Tensor] = {}
         """Parameters of a frozen anchor by name; empty where the buffer or the bare model is the anchor."""
-        if settings.kl.anchor in ("frozen", "dual"):
-            self.anchor = self.trained()
 
     def begin(self) -> None:
         """Called before the first update on a buffer."""
@@ -128,19 +128,23 @@ class Anchored:
         """The model with other weights, while the current ones keep their graph."""
         return lambda *arguments: functional_call(self.model, weights, arguments)
 
-    @contextmanager
-    def anchored(self) -> Iterator[Callable[..., Any]]:
-        """Give the model as it is at the anchor."""
-        if self.settings.kl.anchor != "lora_off":
-            yield self.at(self.anchor)
-            return
-        disable: Any = self.model.disable_adapter
-        with disable():
-            yield self.model
 
+class GrpoTerms(Terms):
+    """Objective and KL of transitions by the ratio of their likelihoods under `model`.
 
-class GrpoTerms(Anchored):
-    """Objective and KL of transitions by the ratio of their likelihoods under `model`."""
+    Raises:
+        ValueError: the anchor is a model without its adapter, and there is none.
+    """
+
+    def __init__(self, model: nn.Module, settings: GrpoConfig, rollout: RolloutConfig, seed: int) -> None:
+        if settings.kl.anchor == "lora_off" and not hasattr(model, "disable_adapter"):
+            raise ValueError(
+                "kl.anchor lora_off needs a model with a LoRA adapter; add one (video_model.adapters.add_lora), or "
+                "take kl.anchor frozen"
+            )
+        super().__init__(model, settings, rollout, seed)
+        if settings.kl.anchor in ("frozen", "dual"):
+            self.anchor = self.trained()
 
     def choose(self, buffer: RolloutBuffer) -> Tensor:
         """Return which transitions train, bool (N, S)."""
@@ -155,7 +159,7 @@ class GrpoTerms(Anchored):
         Args:
             signals_M: the advantages. version: optimizer steps made, for the dual anchor.
         """
-        new = self._transition(self.model, buffer, rows)
+        new = self.transition(self.model, buffer, rows)
         old_zeta = rows.of(buffer.rollout.zeta).flatten(1).float().to(new.zeta.device)
         ratio = self._log_ratio(new, old_zeta)
         objective = clipped_objective(ratio, signals_M, self.settings.clip)
@@ -173,22 +177,37 @@ class GrpoTerms(Anchored):
         due = settings.anchor in ("frozen", "lora_off") or version % settings.dual_every == 0
         if settings.anchor != "buffer" and due:
             with torch.no_grad(), self.anchored() as model:
-                target = self._transition(model, buffer, rows).zeta
+                target = self.transition(model, buffer, rows).zeta
             kl = kl + self._distance(new, target)
         return kl
 
-    # internals
+    @contextmanager
+    def anchored(self) -> Iterator[Callable[..., Any]]:
+        """Give the model as it is at the anchor."""
+        if self.settings.kl.anchor != "lora_off":
+            yield self.at(self.anchor)
+            return
+        disable: Any = self.model.disable_adapter
+        with disable():
+            yield self.model
 
-    def _transition(self, model: Callable[..., Any], buffer: RolloutBuffer, rows: Rows) -> GaussianTransition:
+    def transition(self, model: Callable[..., Any], buffer: RolloutBuffer, rows: Rows) -> GaussianTransition:
+        """Return the normalised noise that leads the rows from x_t to x_s under `model` (DD-1)."""
         device, rollout = device_of(self.model), buffer.rollout
         times = flow_times(self.rollout.num_steps, self.rollout.shift)
         steps = torch.tensor(rollout.steps)[rows.positions]
         where = torch.tensor([rollout.state_steps.index(k) for k in rollout.steps])[rows.positions]
-        x_t, x_s = (rows.of(rollout.states, places).to(device) for places in (where, where + 1))
+        x_t, x_s = (rows.of(rollout.states, places).to(device).float() for places in (where, where + 1))
         t, s = times[torch.stack([steps, steps + 1])].to(device)
         condition = buffer.condition.rows(rows.videos.to(buffer.condition.frames.device)).to(device)
-        mask = rows.of(rollout.mask).to(device)
-        return transition(model, condition, x_t, x_s, t, s, mask, self.rollout)
+        context = StepContext(condition.frames.float(), float(times[1]), rows.of(rollout.mask).to(device))
+        x, K = with_conditioning(x_t, context.conditioning), condition.num_conditioning
+        v = guided_velocity(model, x, t, condition, self.rollout.cfg).float()
+        law = step(x, v, t, s, context, self.rollout.sampler)
+        zeta = normalised_noise(x_s, law, K)
+        return GaussianTransition(zeta.flatten(1), law.std[:, :, K:].expand_as(zeta).flatten(1))
+
+    # internals
 
     def _log_ratio(self, new: GaussianTransition, old_zeta: Tensor) -> Tensor:
         return log_ratio(

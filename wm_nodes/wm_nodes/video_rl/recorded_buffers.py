@@ -4,7 +4,6 @@ Shapes: N clips of a buffer, F frames, H W 3 image.
 """
 
 import hashlib
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -53,8 +52,6 @@ class RecordedClips:
     """uint8 (N H, F W, 3), or None where not read."""
     weights: Mapping[str, float]
     """Of the scores in the total."""
-    audit_ids: tuple[str, ...]
-    """Of the agent's verdicts (N,), "" for a failed one; () where it was not called."""
 
     def frames(self, height: int, width: int) -> Tensor:
         """The clips, uint8 (N, F, H, W, 3), cut out of the picture.
@@ -83,16 +80,18 @@ class Rescored:
     total: Tensor
     """Of now."""
     different: tuple[str, ...]
-    """Names of scores, `total` or `verdicts` whose bits are not the recorded ones."""
+    """Names of scores or `total` whose bits are not the recorded ones."""
     same_reward: bool
     """The total was recorded with the same rewards; else it is not compared."""
     verdicts: tuple[Mapping[str, Any], ...]
-    """The agent's; () where it was not called. Clips without a recorded verdict are not compared."""
+    """The agent's; () where it was not called."""
+    unanswered: int
+    """Clips that the agent gave no reward then, which are not compared."""
 
 
 BufferJudge = Callable[[RecordedClips, Tensor, Clips], tuple[Mapping[str, Tensor], tuple[Mapping[str, Any], ...]]]
 """Judges a buffer's N clips, uint8 (N, F, H, W, 3), given the recordings of their contexts; returns scores, float64
-(N,), by name, and a row per clip with the `audit_id` of its verdict."""
+(N,), by name, and a row per clip of its verdict."""
 
 
 def read_run(run_dir: Path, overrides: dict[str, Any] | None = None) -> tuple[Path, VideoRlConfig]:
@@ -144,8 +143,7 @@ def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
     wanted = (topics.CLIPS, topics.CLIP_SCORES, *((topics.CLIP_IMAGES,) if pictures else ()))
     rows = {topics.absolute(topics.DEFAULT_NAMESPACE, topic): topic for topic in wanted}
     with Bag(bag) as opened:
-        opened.check_types([*rows, topics.absolute(topics.DEFAULT_NAMESPACE, topics.VERDICT)])
-        verdicts = _read_verdicts(opened)
+        opened.check_types(list(rows))
         for name in rows:
             if not opened.count(name):
                 raise BagError(f"bag {bag} has no message on {name}; name a recorded run of train-video-model")
@@ -159,7 +157,7 @@ def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
                 clips[message.sha256] = message
             elif (batch := clips.pop(message.buffer_sha256, None)) is not None:
                 picture = shown.pop(stamp_ns(batch.header.stamp), None)
-                yield _join_scores(batch, message, picture, _match_audit_ids(verdicts, message))
+                yield _join_scores(batch, message, picture)
 
 
 def rescore(recorded: RecordedClips, source: RecordedContexts, judge: BufferJudge | None = None) -> Rescored:
@@ -198,14 +196,12 @@ def rescore(recorded: RecordedClips, source: RecordedContexts, judge: BufferJudg
     pairs = {name: (values, scores[name].double()) for name, values in recorded.scores.items() if name in scores}
     if same_reward:
         pairs["total"] = recorded.total, total
-    ids, answered = recorded.audit_ids, torch.ones(len(total), dtype=torch.bool)
-    if verdicts and ids:
-        answered = torch.tensor([bool(audit_id) for audit_id in ids])
+    answered = torch.ones(len(total), dtype=torch.bool)
+    if verdicts and AGENT in recorded.scores:
+        answered = torch.isfinite(recorded.scores[AGENT])
     bits = {name: [some[answered].numpy().tobytes() for some in pair] for name, pair in pairs.items()}
-    different = [name for name, (old, new) in bits.items() if old != new]
-    if any(old and old != verdict["audit_id"] for old, verdict in zip(ids, verdicts)):
-        different.append("verdicts")
-    return Rescored(recorded, total, tuple(different), same_reward, verdicts)
+    different = tuple(name for name, (old, new) in bits.items() if old != new)
+    return Rescored(recorded, total, different, same_reward, verdicts, int((~answered).sum()))
 
 
 def recorded_buffer(
@@ -249,27 +245,7 @@ def trained_clips(bags: Sequence[Path], iterations: int) -> list[RecordedClips]:
     return [clips[iteration] for iteration in range(iterations)]
 
 
-def _read_verdicts(bag: Bag) -> dict[tuple[str, int], list[tuple[int, str]]]:
-    """Return (stamp in ns, audit id) of every verdict on a clip (sha256 of its buffer, row), in the order of their
-    stamps; the audit id of a failed one is ""."""
-    verdicts = defaultdict[tuple[str, int], list[tuple[int, str]]](list)
-    name = topics.absolute(topics.DEFAULT_NAMESPACE, topics.VERDICT)
-    for _, _, data in bag.messages([name]) if bag.count(name) else ():
-        message = bag.decode(data, topics.VERDICT.msgtype)
-        audit_id = "" if message.status == message.ERROR else str(message.audit_id)
-        verdicts[message.buffer_sha256, int(message.clip)].append((stamp_ns(message.header.stamp), audit_id))
-    return {key: sorted(values) for key, values in verdicts.items()}
-
-
-def _match_audit_ids(verdicts: Mapping[tuple[str, int], list[tuple[int, str]]], scores: Any) -> tuple[str, ...]:
-    """Return the audit ids of the verdicts behind a ClipScores, each clip's newest before; () where one is missing."""
-    until, matches = stamp_ns(scores.header.stamp), list[str]()
-    for clip in range(int(scores.num_clips)):
-        matches += [audit for stamp, audit in verdicts.get((scores.buffer_sha256, clip), ()) if stamp <= until][-1:]
-    return tuple(matches) if len(matches) == int(scores.num_clips) else ()
-
-
-def _join_scores(batch: Any, scores: Any, picture: UInt8Array | None, audit_ids: tuple[str, ...]) -> RecordedClips:
+def _join_scores(batch: Any, scores: Any, picture: UInt8Array | None) -> RecordedClips:
     count = int(scores.num_clips)
     values = torch.from_numpy(np.array(scores.values, np.float64)).view(len(scores.names), count)
     valid = torch.from_numpy(np.array(scores.valid, np.uint8)).bool()
@@ -278,5 +254,5 @@ def _join_scores(batch: Any, scores: Any, picture: UInt8Array | None, audit_ids:
     return RecordedClips(
         int(batch.iteration), int(batch.policy_version), contexts, int(batch.num_frames), batch.buffer_uri,
         batch.sha256, dict(zip(scores.names, values, strict=True)), torch.where(valid, total, torch.nan), picture,
-        dict(zip(scores.names, map(float, scores.weights), strict=True)), audit_ids,
+        dict(zip(scores.names, map(float, scores.weights), strict=True)),
     )

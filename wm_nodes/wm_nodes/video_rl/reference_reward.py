@@ -7,7 +7,6 @@ the held-out metrics beside which a judge's reward is watched (DD-2).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,44 +27,24 @@ TRACKING_SCALE_M, OUTCOME_SCALE_M = 0.03, 0.05
 """An error of this much takes the tracking score, or the outcome, to 1 / e."""
 SEEN_MOTION = 12
 """A pixel counts as scenery while no recorded frame differs from the first one by more than this, of 255."""
-ERRORS = (
-    "scenery", "object_cm", "tool_cm", "executed_object_cm", "ghost_motion", "impossible_tool_steps", "scenery_change",
-)
-"""Scores of which less is better; the last four are heldout_metrics.UNREWARDED."""
+ERRORS = ("scenery", "object_cm", "tool_cm", "executed_object_cm", "impossible_tool_steps")
+"""Scores of which less is better; the last two are heldout_metrics.UNREWARDED."""
+CLIP_SCORES = ("tracking", "scenery", "psnr_db", "object_cm", "tool_cm", "success", "outcome")
+"""What score_clips() gives."""
 PICTURE_SCORES = ("ssim", "perceptual", "closeness")
 """What score_pictures() gives."""
 FULL_PSNR_DB = 40.0
 """A frame of this PSNR or more has 1 for it in closeness."""
 
 
-@dataclass(frozen=True)
-class ClipScores:
-    """Per clip, float64 (N,), in the host's memory. All but scenery and psnr_db are NaN where the recording has no
-    simulator state."""
+def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_conditioning: int) -> dict[str, Tensor]:
+    """Score decoded clips, uint8 (N, F, H, W, 3), against the recordings of their contexts, where the clips are; return
+    CLIP_SCORES, float64 (N,) in the host's memory.
 
-    tracking: Tensor
-    """Mean exp(-error / 3 cm) of object and tool over generated frames, in (0, 1]."""
-    scenery: Tensor
-    """Mean absolute error, [0, 1], where the recording stands still."""
-    psnr_db: Tensor
-    """Of generated frames."""
-    object_cm: Tensor
-    """Mean position error of the object."""
-    tool_cm: Tensor
-    """Mean position error of the tool."""
-    motion: Tensor
-    """Object path length, share of the recorded one, at most 2; 1 where the recorded object stands still."""
-    success: Tensor
-    """1 where the task is done in the last frame."""
-    outcome: Tensor
-    """exp(-d / 5 cm), d what is then left to the edge of the goal (DD-32)."""
-
-    def named(self) -> dict[str, Tensor]:
-        return dict(vars(self))
-
-
-def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_conditioning: int) -> ClipScores:
-    """Score decoded clips, uint8 (N, F, H, W, 3), against the recordings of their contexts, where the clips are.
+    tracking: mean exp(-error / 3 cm) of object and tool over generated frames, in (0, 1]. scenery: mean absolute error,
+    [0, 1], where the recording stands still. psnr_db: of generated frames. object_cm, tool_cm: mean position errors.
+    success: 1 where the task is done in the last frame. outcome: exp(-d / 5 cm), d what is then left to the edge of the
+    goal (DD-32). All but scenery and psnr_db are NaN where the recording has no simulator state.
 
     Raises:
         ValueError: clips and recordings differ in number or size.
@@ -83,16 +62,16 @@ def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_con
     still = (~changed)[:, None, :, :, None].float()
     weight = still.sum((1, 2, 3, 4)).clamp_min(1) * error.shape[1] * error.shape[4]
     left_m = distance_left(positions[:, -1], truth[:, -1], references.task)
-    return ClipScores(
-        tracking=torch.from_numpy(tracking.mean(1)).double(),
-        scenery=((error.abs() * still).sum((1, 2, 3, 4)) / weight).double().cpu(),
-        psnr_db=(-10 * error.square().mean((1, 2, 3, 4)).clamp_min(1e-8).log10()).double().cpu(),
-        object_cm=torch.from_numpy(100 * object_m.mean(1)).double(),
-        tool_cm=torch.from_numpy(100 * tool_m.mean(1)).double(),
-        motion=torch.from_numpy(_path_share(positions[..., thing], truth[..., thing])).double(),
-        success=torch.from_numpy(np.where(np.isfinite(left_m), left_m <= 0, left_m)).double(),
-        outcome=torch.from_numpy(np.exp(-np.maximum(left_m, 0) / OUTCOME_SCALE_M)).double(),
+    scores = (
+        torch.from_numpy(tracking.mean(1)),
+        (error.abs() * still).sum((1, 2, 3, 4)) / weight,
+        -10 * error.square().mean((1, 2, 3, 4)).clamp_min(1e-8).log10(),
+        torch.from_numpy(100 * object_m.mean(1)),
+        torch.from_numpy(100 * tool_m.mean(1)),
+        torch.from_numpy(np.where(np.isfinite(left_m), left_m <= 0, left_m)),
+        torch.from_numpy(np.exp(-np.maximum(left_m, 0) / OUTCOME_SCALE_M)),
     )
+    return {name: values.double().cpu() for name, values in zip(CLIP_SCORES, scores, strict=True)}
 
 
 def score_pictures(
@@ -140,10 +119,8 @@ def distance_left(positions: FloatArray, truth: FloatArray, task: str) -> FloatA
 
 
 def more_is_better(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """Return a score as a number of which more is better: errors negated, motion as -|1 - motion|, others unchanged."""
+    """Return a score as a number of which more is better: errors negated, others unchanged."""
     scores: NDArray[np.float64] = np.asarray(values, np.float64)
-    if name == "motion":
-        scores = -np.abs(1 - scores)
     return -scores if name in ERRORS else scores
 
 
@@ -171,11 +148,3 @@ def mix_rewards(values: Mapping[str, Tensor], weights: Mapping[str, float]) -> T
 def _check_sizes(frames: Tensor, references: Clips) -> None:
     if frames.shape != references.frames.shape:
         raise ValueError(f"clips are {tuple(frames.shape)}, their recordings {tuple(references.frames.shape)}")
-
-
-def _path_share(positions: FloatArray, truth: FloatArray) -> FloatArray:
-    """Return the distance from first to last generated frame over the true one, at most 2; 1 where nothing moves, NaN
-    where that is unknown."""
-    distance, wanted = (np.linalg.norm(path[:, -1] - path[:, 0], axis=-1) for path in (positions, truth))
-    share: FloatArray = np.where(wanted > 0.01, np.minimum(distance / np.maximum(wanted, 1e-6), 2.0), 1.0)
-    return np.where(np.isnan(wanted), wanted, share)

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from wm_nodes.core.statistics import t_975
-from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, ClipScores, more_is_better
+from wm_nodes.video_rl.reference_reward import CLIP_SCORES, PICTURE_SCORES, more_is_better
 
 SECTION = "heldout"
 """Of metrics.jsonl: scores by name, mean over the contexts, at the number of buffers trained on."""
-WATCHED = (*ClipScores.__dataclass_fields__, *PICTURE_SCORES)
+WATCHED = (*CLIP_SCORES, *PICTURE_SCORES)
 
 
 def find_hacked_metrics(proxy: Sequence[float], held_out: Mapping[str, Sequence[float]]) -> dict[str, float]:

@@ -170,7 +170,7 @@ class RecordedContexts:
         also: scores that are wanted beside the rewards.
         """
         references, (_, given) = self.references(request), self.place(request)
-        scores = score_clips(frames, references, self.probe, given).named()
+        scores = score_clips(frames, references, self.probe, given)
         if not {*self.config.rewards, *also}.isdisjoint(PICTURE_SCORES):
             scores |= score_pictures(frames, references, self.folder.codec, given)
         if self.execution is not None:

@@ -94,30 +94,6 @@ class Scenes:
         return Condition(self.videos(self.action)[:, :, :1].contiguous(), actions, torch.zeros(len(self), 1, 0))
 
 
-@dataclass(frozen=True)
-class Scores:
-    """Per video, float64 (B,)."""
-
-    task: Tensor
-    """Mean exp(-path error / 2), in (0, 1]."""
-    mass: Tensor
-    """Opacity kept, 1 is all of it."""
-    background: Tensor
-    """Mean square error away from the disc."""
-    obeyed: Tensor
-    """1 where the disc went more than MOVED_CELLS the commanded way."""
-    consistency: Tensor
-    """exp(-change from frame to frame / CHANGE), 1 for a picture that stands still."""
-
-    @property
-    def reward(self) -> Tensor:
-        """The training reward: task + 0.3 min(mass, 1) - 10 background. More opacity than the disc has pays nothing."""
-        return self.task + 0.3 * self.mass.clamp(max=1) - 10 * self.background
-
-    def named(self) -> dict[str, Tensor]:
-        return {"reward": self.reward, **vars(self)}
-
-
 def draw_scenes(count: int, seed: int, name: str, index: int = 0, side: int = SIDE) -> Scenes:
     """Draw scenes of side x side pixels; the same scenes at every resolution."""
     generator, scale = torch_stream(seed, f"moving_disc_{name}", index), side / SIDE
@@ -130,8 +106,14 @@ def draw_scenes(count: int, seed: int, name: str, index: int = 0, side: int = SI
     )
 
 
-def score(videos: Tensor, scenes: Scenes) -> Scores:
-    """Score videos (B, C, F, H, W) of the scenes, from their pixels and the known background, where the videos are."""
+def score(videos: Tensor, scenes: Scenes) -> dict[str, Tensor]:
+    """Score videos (B, C, F, H, W) of the scenes by name, float64 (B,), from their pixels and the known background.
+
+    reward: task + 0.3 min(mass, 1) - 10 background; more opacity than the disc has pays nothing. task: mean
+    exp(-path error / 2), in (0, 1]. mass: opacity kept, 1 is all of it. background: mean square error away from the
+    disc. obeyed: 1 where the disc went more than MOVED_CELLS the commanded way. consistency: exp(-change from frame to
+    frame / CHANGE), 1 for a picture that stands still.
+    """
     scenes = scenes.to(videos.device)
     contrast = (COLOUR.to(videos.device).view(1, 2, 1, 1) - scenes.background)[:, :, None]
     seen = ((videos.float() - scenes.background[:, :, None]) * contrast).sum(1) / contrast.square().sum(1)
@@ -150,12 +132,14 @@ def score(videos: Tensor, scenes: Scenes) -> Scores:
     wrong = (videos.float() - scenes.background[:, :, None]).square() * away
     travelled = ((centre[:, -1] - centre[:, 0]) * DIRECTIONS.to(videos.device)[scenes.action]).sum(1) / scenes.scale
     change = videos.float().diff(dim=2).square().mean((1, 2, 3, 4))
-    return Scores(
-        task=torch.exp(-error[:, 1:] / 2).mean(1).double(),
-        mass=(alpha[:, 1:].sum((2, 3)).mean(1) / alpha[:, 0].sum((1, 2)).clamp_min(1e-6)).double(),
-        background=(wrong[:, :, 1:].sum((1, 2, 3, 4)) / (2 * away[:, :, 1:].sum((1, 2, 3, 4))).clamp_min(1)).double(),
-        obeyed=((travelled > MOVED_CELLS) & ~lost[:, -1]).double(), consistency=torch.exp(-change / CHANGE).double(),
-    )
+    task = torch.exp(-error[:, 1:] / 2).mean(1).double()
+    mass = (alpha[:, 1:].sum((2, 3)).mean(1) / alpha[:, 0].sum((1, 2)).clamp_min(1e-6)).double()
+    background = (wrong[:, :, 1:].sum((1, 2, 3, 4)) / (2 * away[:, :, 1:].sum((1, 2, 3, 4))).clamp_min(1)).double()
+    return {
+        "reward": task + 0.3 * mass.clamp(max=1) - 10 * background, "task": task, "mass": mass,
+        "background": background, "obeyed": ((travelled > MOVED_CELLS) & ~lost[:, -1]).double(),
+        "consistency": torch.exp(-change / CHANGE).double(),
+    }
 
 
 @dataclass(frozen=True)
@@ -177,7 +161,7 @@ class ToyContexts:
         network: samples as it is, so loading newer weights into it is enough.
         config: its seed, groups, window and rollout are used.
         side: of the pictures, px.
-        reward: the score that trains, a name of Scores.
+        reward: the score that trains, a name of score().
     """
 
     def __init__(
@@ -205,10 +189,10 @@ class ToyContexts:
 
     def score(self, request: SceneRequest, clips: RolloutBuffer) -> RolloutBuffer:
         """Return the buffer with every score of its videos, and as `total` the one that trains."""
-        scores = score(clips.rollout.latents, request.scenes.rows(clips.group_ids)).named()
+        scores = score(clips.rollout.latents, request.scenes.rows(clips.group_ids))
         return clips.with_rewards({**scores, "total": scores[self.reward]})
 
-    def evaluate(self, scenes: Scenes) -> Scores:
+    def evaluate(self, scenes: Scenes) -> dict[str, Tensor]:
         """Score one video of each scene, sampled by ODE."""
         seeds, settings = self._seeds("evaluation", 0, torch.arange(len(scenes))), self.config.rollout
         self.network.eval()

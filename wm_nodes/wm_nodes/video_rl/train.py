@@ -52,7 +52,7 @@ def main() -> None:
     source = ToyContexts(load_base(device=compute_device(config.device)), config)
     learner = GrpoLearner(source.network, config.grpo, config.rollout, seed=config.seed)
     for iteration, (_, report) in enumerate(post_train(learner, sample_buffers(source, learner, 20)), 1):
-        obeyed = source.evaluate(draw_scenes(100, config.seed, "evaluation")).obeyed.mean()
+        obeyed = source.evaluate(draw_scenes(100, config.seed, "evaluation"))["obeyed"].mean()
         print(f"buffer {iteration}: training reward {report.reward_mean:.2f}; {obeyed:.0%} of held-out clips obey")
 
 

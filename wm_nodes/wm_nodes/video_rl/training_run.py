@@ -6,7 +6,6 @@ versions: run_dir/video_policies/video_<optimizer steps>.safetensors; version 0 
 import json
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import device_of, explain_memory
 from wm_nodes.training.checkpoint import RESTORE, DamagedFileError, read_metadata
 from wm_nodes.training.metrics import MetricsWriter, read_metrics
-from wm_nodes.training.ranks import Ranks, broadcast_bytes
 from wm_nodes.training.run_folder import TrainingRun, VersionFiles
 from wm_nodes.training.weights import PackedWeights, save_weights
 from wm_nodes.video_model import RolloutBuffer, VideoNetwork
@@ -47,26 +45,25 @@ class VideoRun(TrainingRun):
 
     Args:
         keep_versions: files kept in run_dir/video_policies, at least 2.
-        heldout: scores of held-out contexts by the network's weights, asked for by rank 0 after every
-            `evaluation.every`-th buffer; None: never.
+        heldout: scores of held-out contexts by the network's weights, asked for after every `evaluation.every`-th
+            buffer; None: never.
     """
 
     files, checkpoint = VIDEO_FILES, CHECKPOINT
 
     def __init__(
         self, network: VideoNetwork, config: VideoRlConfig, run_dir: Path, *, keep_versions: int = 20,
-        tensorboard: bool = False, ranks: Ranks | None = None, heldout: HeldoutScores | None = None,
+        tensorboard: bool = False, heldout: HeldoutScores | None = None,
     ) -> None:
-        super().__init__(run_dir, keep_versions, ranks)
+        super().__init__(run_dir, keep_versions)
         self.network, self.config, self._heldout = network, config, heldout
         self._training = threading.Lock()
-        self.learner = GrpoLearner(network, config.grpo, config.rollout, seed=config.seed, ranks=ranks)
+        self.learner = GrpoLearner(network, config.grpo, config.rollout, seed=config.seed)
         if (run_dir / CHECKPOINT).is_file():
             self.learner.load(run_dir / CHECKPOINT)
-        self._metrics = MetricsWriter(run_dir, tensorboard=tensorboard) if self.ranks.rank == 0 else None
+        self._metrics = MetricsWriter(run_dir, tensorboard=tensorboard)
         self.check: Callable[[], None] = lambda: None
-        """Called before every call of the network; what it raises ends the training with nothing changed. With several
-        ranks it is not called: one that stopped would leave the others waiting."""
+        """Called before every call of the network; what it raises ends the training with nothing changed."""
         self.alarms: dict[str, float] = {}
         """Of reward hacking, by the newest held-out evaluation (DD-2), see hacking_alarms."""
 
@@ -88,24 +85,16 @@ class VideoRun(TrainingRun):
             As GrpoLearner.train; or OSError where saving fails: the training was then made; ensure_saved() tries again.
         """
         with self._training:
-            if self.ranks.size > 1 and self.ranks.rank == 0:
-                broadcast_bytes(buffer.to_bytes(), self.ranks)
-            stops = self.network.register_forward_pre_hook(lambda *_: self.check() if self.ranks.size == 1 else None)
+            stops = self.network.register_forward_pre_hook(lambda *_: self.check())
             device, micro_batch = device_of(self.network), self.config.grpo.micro_batch
             with stops, explain_memory(device, grpo__micro_batch=micro_batch):
                 if self.config.rollout.buffer_device == "model":
                     buffer = buffer.to(device)
                 report = self.learner.train(buffer)
-            if self._metrics is not None:
-                self.save()
-                self._metrics.write("grpo", self.iterations, flatten_metrics(report))
-                self._watch(self._metrics)
+            self.save()
+            self._metrics.write("grpo", self.iterations, flatten_metrics(report))
+            self._watch()
             return report
-
-    def follow(self) -> None:
-        while (data := broadcast_bytes(None, self.ranks)) is not None:
-            with suppress(ValueError, FloatingPointError):  # rank 0 has raised and reported the same
-                self.train(RolloutBuffer.from_bytes(data))
 
     def write_files(self) -> PackedWeights:
         packed = save_weights(self.network, self.run_dir / self.files.uri(self.version), {"version": str(self.version)})
@@ -113,29 +102,26 @@ class VideoRun(TrainingRun):
         return packed
 
     def close(self) -> None:
-        """Wait for the training at hand; let the other ranks end."""
+        """Wait for the training at hand."""
         with self._training:
-            if self._metrics is not None:
-                self._metrics.close()
-                broadcast_bytes(None, self.ranks)
+            self._metrics.close()
 
-    def _watch(self, metrics: MetricsWriter) -> None:
+    def _watch(self) -> None:
         every = self.config.evaluation.every
         if self._heldout is None or not every or self.iterations % every:
             return
         scores = self._heldout()
         lines = [*read_metrics(self.run_dir), {"section": SECTION, "step": self.iterations, **scores}]
         self.alarms = hacking_alarms(lines, self.config.evaluation.window)
-        metrics.write(SECTION, self.iterations, {**scores, **self.alarms})
+        self._metrics.write(SECTION, self.iterations, {**scores, **self.alarms})
 
 
 def flatten_metrics(report: BufferReport) -> dict[str, float]:
     """Return one number per name; those of the k-th optimizer step on a buffer end in _<k>, from 1."""
     values = asdict(report)
-    updates, rewards, noise = (values.pop(name) for name in ("updates", "raw_rewards", "step_noise"))
+    updates, rewards = values.pop("updates"), values.pop("raw_rewards")
     metrics = {name: float(value) for name, value in values.items()}
     metrics |= {f"reward_{name}": value for name, value in rewards.items()}
-    metrics |= {f"noise_share_step_{k}": value for k, value in noise.items()}
     for index, update in enumerate(updates, 1):
         metrics |= {f"{name}_{index}": float(value) for name, value in update.items()}
     return metrics

@@ -1,10 +1,7 @@
-"""What the learners of both loops share: an action that trains, the announcement of versions, ranks behind the node."""
+"""What the learners of both loops share: an action that trains, and the announcement of versions."""
 
-import os
-import signal
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 from wm_msgs.msg import PolicyVersion
@@ -12,10 +9,8 @@ from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.ros import convert
 from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.params import COMMON, Param, read_parameters
-from wm_nodes.ros.spin import run_node
+from wm_nodes.ros.params import Param
 from wm_nodes.ros.worker import Work
-from wm_nodes.training.ranks import Ranks, join
 from wm_nodes.training.run_folder import TrainingRun
 from wm_nodes.training.run_lock import RunLock
 
@@ -25,17 +20,13 @@ class TrainingNode(ManagedNode):
 
     A subclass calls hold_run_folder() in configure(), makes the run and calls serve_training(); it says in train() how
     a goal is trained and in fill() what a result holds. The Result of the action has the reason PAUSED, too.
-
-    Args:
-        ranks: this process is rank 0 of them.
     """
 
     inline_limit_bytes = 0
     """Weights up to this size travel inside the announcement."""
 
-    def __init__(self, params: Sequence[Param], ranks: Ranks | None = None, **node_arguments: Any) -> None:
+    def __init__(self, params: Sequence[Param], **node_arguments: Any) -> None:
         super().__init__("learner", params, **node_arguments)
-        self.ranks = ranks or Ranks()
 
     @abstractmethod
     def train(self, work: Work, result: Any) -> None:
@@ -91,24 +82,3 @@ class TrainingNode(ManagedNode):
             self.get_logger().warning(f"training ended: {result.message}")
         else:
             self.get_logger().info(f"training ended after update {self._run.updates}")
-
-
-def run_learner(
-    make_node: Callable[[Ranks], TrainingNode], params: Sequence[Param],
-    make_run: Callable[[Mapping[str, Any], Path, Ranks], TrainingRun], device: Callable[[str], str],
-) -> int:
-    """One process, or under torchrun rank 0 as the node and the other ranks behind it; return the exit code.
-
-    Args:
-        make_run: the run of another rank, of the values of the node's parameters and the run folder.
-        device: the setting of a configuration file.
-    """
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        return run_node(lambda: make_node(Ranks()))
-    values = read_parameters("learner", (*COMMON, *params))
-    ranks = join(device(str(values["config_file"])))
-    if ranks.rank == 0:
-        return run_node(lambda: make_node(ranks))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # rank 0 ends the others
-    make_run(values, Path(str(values["run_dir"])), ranks).follow()
-    return 0

@@ -10,13 +10,13 @@ in no diffusers folder. WanVelocity takes any module with the call of WanTransfo
 published network is all that is missing, beside its text encoder (last hidden states of Qwen2.5-VL).
 """
 
-from wm_nodes.video_model.adapters.codec import TextEncoder, VideoCodec
+from wm_nodes.video_model.adapters.codec import VideoCodec
 from wm_nodes.video_model.adapters.cosmos import CosmosVelocity
 from wm_nodes.video_model.adapters.loading import PublicVideoModel, load_public_model
 from wm_nodes.video_model.adapters.velocity import PublicVelocity, add_lora, save_lora
 from wm_nodes.video_model.adapters.wan import WanVelocity
 
 __all__ = [
-    "CosmosVelocity", "PublicVelocity", "PublicVideoModel", "TextEncoder", "VideoCodec", "WanVelocity", "add_lora",
+    "CosmosVelocity", "PublicVelocity", "PublicVideoModel", "VideoCodec", "WanVelocity", "add_lora",
     "load_public_model", "save_lora",
 ]

@@ -1,11 +1,10 @@
-"""Camera frames to latents and back, through the VAE of a public model; instructions to the tokens it attends to.
+"""Camera frames to latents and back, through the VAE of a public model.
 
 Shapes: B batch, N camera frames, H W camera pixels, C latent channels, h w latent grid, F = 1 + (N - 1) / 4 latent
-frames, L tokens, E values.
+frames.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -15,13 +14,11 @@ from torch import Tensor
 class VideoCodec:
     """AutoencoderKLWan, with latents normalised to mean 0 and deviation 1 per channel, as the models take them.
 
-    Args:
-        device: where it computes. offload: it rests on the CPU and visits the device for each call.
+    device: where it computes.
     """
 
-    def __init__(self, vae: Any, *, device: str | torch.device = "cpu", offload: bool = False) -> None:
-        self.vae = vae.requires_grad_(False).eval()
-        self.device, self.offload = torch.device(device), offload
+    def __init__(self, vae: Any, *, device: str | torch.device = "cpu") -> None:
+        self.vae, self.device = vae.requires_grad_(False).eval().to(device), torch.device(device)
         self._mean, self._std = (
             torch.tensor(values, device=self.device, dtype=torch.float32).view(1, -1, 1, 1, 1)
             for values in (vae.config.latents_mean, vae.config.latents_std)
@@ -41,7 +38,7 @@ class VideoCodec:
             latents: Tensor = self.vae.encode(pixels.to(self.vae.dtype)).latent_dist.mode().float()
             return (latents - self._mean) / self._std
 
-        return self._one_by_one(part, frames)
+        return _one_by_one(part, frames)
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> Tensor:
@@ -52,12 +49,7 @@ class VideoCodec:
             pixels: Tensor = self.vae.decode(raw.to(self.vae.dtype), return_dict=False)[0].float()
             return ((pixels + 1) * 127.5).round().clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 4, 1).contiguous()
 
-        return self._one_by_one(part, latents)
-
-    def _one_by_one(self, function: Callable[[Tensor], Tensor], clips: Tensor) -> Tensor:
-        """The results of one clip at a time, since the VAE's memory grows with them."""
-        with visiting(self.vae, self.device, self.offload):
-            return torch.cat([function(clip) for clip in torch.split(clips, 1)])  # type: ignore[no-untyped-call]
+        return _one_by_one(part, latents)
 
     def _check(self, frames: Tensor) -> None:
         if frames.dtype != torch.uint8 or frames.ndim != 5 or frames.shape[-1] != 3:
@@ -72,37 +64,6 @@ class VideoCodec:
             )
 
 
-class TextEncoder:
-    """The way of a diffusers pipeline from prompts to tokens, padded to `max_tokens`, because the models attend to
-    padding.
-
-    Args:
-        pipeline: with tokenizer and text encoder.
-        device: where it computes. offload: the encoder rests on the CPU and visits the device for each call.
-    """
-
-    def __init__(
-        self, pipeline: Any, *, device: str | torch.device = "cpu", offload: bool = False, max_tokens: int = 512
-    ) -> None:
-        pipeline.text_encoder.requires_grad_(False).eval()
-        self.pipeline, self.device, self.offload, self.max_tokens = pipeline, torch.device(device), offload, max_tokens
-
-    @torch.no_grad()
-    def encode(self, prompts: list[str]) -> Tensor:
-        """Return (B, L, E) on the device."""
-        with visiting(self.pipeline.text_encoder, self.device, self.offload):
-            text: Tensor = self.pipeline.encode_prompt(
-                prompts, do_classifier_free_guidance=False, max_sequence_length=self.max_tokens, device=self.device
-            )[0]
-        return text
-
-
-@contextmanager
-def visiting(module: Any, device: torch.device, offload: bool) -> Iterator[None]:
-    """Have a module on a device; offload: it goes back to the CPU afterwards."""
-    module.to(device)
-    try:
-        yield
-    finally:
-        if offload:
-            module.to("cpu")
+def _one_by_one(function: Callable[[Tensor], Tensor], clips: Tensor) -> Tensor:
+    """The results of one clip at a time, since the VAE's memory grows with them."""
+    return torch.cat([function(clip) for clip in torch.split(clips, 1)])  # type: ignore[no-untyped-call]

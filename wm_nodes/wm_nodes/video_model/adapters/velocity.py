@@ -103,7 +103,7 @@ class PublicVelocity(nn.Module, ABC):
         if self.null_text.shape != text.shape[1:]:
             raise ValueError(
                 f"text is {tuple(text.shape[1:])} (tokens, values), the negative prompt {tuple(self.null_text.shape)}; "
-                f"embed both with the same TextEncoder, public models attend to the padding too"
+                f"embed both with embed_prompts, public models attend to the padding too"
             )
         return torch.where(drop.to(text.device).view(-1, 1, 1), self.null_text.to(text), text)
 
