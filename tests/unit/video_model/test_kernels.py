@@ -24,16 +24,8 @@ from video_toys import (
 
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import RolloutConfig
-from wm_nodes.video_model import (
-    StepContext,
-    estimates,
-    flow_times,
-    initial_noise,
-    sample_videos,
-    select_steps,
-    step,
-)
-from wm_nodes.video_model.kernels import SIGMA_LIMIT, with_conditioning
+from wm_nodes.video_model import StepContext, flow_times, initial_noise, sample_videos, select_steps, step
+from wm_nodes.video_model.kernels import SIGMA_LIMIT, estimates, with_conditioning
 
 BIG = (1, 4, 8, 16, 16)
 """D = 8192."""

@@ -13,9 +13,9 @@ from video_toys import (
     toy_condition,
 )
 
-from wm_nodes.video_model import StepContext, dynamic_mask, step
+from wm_nodes.video_model import StepContext, step
 from wm_nodes.video_model.kernels import SIGMA_LIMIT
-from wm_nodes.video_model.mask import quantile, residual
+from wm_nodes.video_model.mask import dynamic_mask, quantile, residual
 from wm_nodes.video_rl.toy_scene import draw_scenes, opacity_at
 
 BIG = (2, 4, 8, 16, 16)

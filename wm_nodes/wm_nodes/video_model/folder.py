@@ -98,8 +98,7 @@ def _load_codec(folder: Path, sha256: str, kind: str, **settings: Any) -> Tokeni
         if pack_weights(shared).sha256 != sha256:
             raise ModelFolderError(f"{folder} was made with another tokenizer than {folder.parent}'s; train it anew")
         return shared
-    settings["config"] = TokenizerConfig.model_validate(settings["config"])
-    codec = TokenizerCodec(**settings)
+    codec = TokenizerCodec(**settings | {"config": TokenizerConfig.model_validate(settings["config"])})
     load_module(folder / CODEC, codec, sha256)
     return codec
 

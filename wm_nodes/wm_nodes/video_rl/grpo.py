@@ -151,8 +151,7 @@ class GrpoLearner:
         kept = best_of_n(advantages.advantages_N, buffer.group_ids, advantages.kept_N, settings.best_of_n)
         skipped = 0 if bool(kept.any()) else self.skipped + 1
         if dropped == advantages.num_groups or skipped >= MAX_SKIPPED:
-            kind = ValueError if dropped == advantages.num_groups else NothingToLearnError
-            raise kind(
+            raise (ValueError if dropped == advantages.num_groups else NothingToLearnError)(
                 f"nothing to learn from: {invalid} of {len(buffer)} rewards are invalid, {dropped} of "
                 f"{advantages.num_groups} groups have too few valid ones and {advantages.num_zero_std - dropped} no "
                 f"spread; {self.skipped} buffers before it were skipped; look at the reward"
