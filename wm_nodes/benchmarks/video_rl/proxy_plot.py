@@ -20,12 +20,13 @@ def plot_proxy(rows: Sequence[dict[str, Any]], path: Path) -> None:
     names = list(dict.fromkeys(str(row["sampler"]) for row in rows))
     figure = make_figure(7.5, 4.8)
     axes = figure.subplots()
-    style_axes(axes, "every training from first to last", "reward paid in training", "success executed in simulator")
+    paid_as = "reward paid in training, weights summing to 1"
+    style_axes(axes, "every training from first to last", paid_as, "success executed in simulator")
     for name, colour in zip(names, (*COLOURS, *MORE_COLOURS), strict=False):
         for row in (row for row in rows if row["sampler"] == name):
-            paid = row["buffers"]["reward_mean"]
+            paid = np.array(row["buffers"]["reward_mean"]) / sum(weight for _, weight in row["plan"]["rewards"])
             start = paid[0], row["measured"]["0"][EXECUTED]
-            end = float(np.mean(paid[-LAST:])), last_measured(row)[EXECUTED]
+            end = paid[-LAST:].mean(), last_measured(row)[EXECUTED]
             axes.plot(*zip(start, end, strict=True), color=colour, alpha=0.35, linewidth=0.9)
             axes.plot(*start, "o", color=colour, markersize=4, fillstyle="none")
             axes.plot(*end, "o", color=colour, markersize=5)

@@ -114,19 +114,18 @@ def cut_windows(
 ) -> tuple[Tensor, Condition]:
     """Cut K + n frames out of each of B videos (B, C, F, h, w), of which the first K are given.
 
-    K of 1 to given_frames and n of 1 to new_frames are drawn for the batch, the place for each video. condition: of the
-    whole videos.
+    K of 1 to given_frames and n of 1 to new_frames, or to what is left, are drawn for the batch, the place for each
+    video. condition: of the whole videos.
 
     Raises:
-        ValueError: the videos are shorter than the longest cut.
+        ValueError: the videos have no frame after the given ones.
     """
     B, _, count = videos.shape[:3]
-    if count < settings.given_frames + settings.new_frames:
-        raise ValueError(
-            f"videos of {count} frames have no {settings.given_frames} + {settings.new_frames} to be cut out; lower "
-            "model.training.given_frames or new_frames"
-        )
-    K, n = (int(rng.integers(1, most + 1)) for most in (settings.given_frames, settings.new_frames))
+    if count <= settings.given_frames:
+        raise ValueError(f"videos of {count} frames have none after {settings.given_frames} given ones; lower "
+                         "model.training.given_frames")
+    K = int(rng.integers(1, settings.given_frames + 1))
+    n = int(rng.integers(1, min(settings.new_frames, count - K) + 1))
     starts = torch.from_numpy(rng.integers(0, count - K - n + 1, B)).to(videos.device)
     places = starts.unsqueeze(1) + torch.arange(K + n, device=videos.device)
     index = torch.arange(B, device=videos.device).unsqueeze(1)
@@ -155,7 +154,7 @@ def change_std(latents: Tensor, num_conditioning: int, new_frames: int = 0) -> f
     if num_conditioning == 0:
         return float(latents.square().mean().sqrt())
     if new_frames:
-        later = [latents[:, :, lag:] - latents[:, :, :-lag] for lag in range(1, new_frames + 1)]
+        later = [latents[:, :, lag:] - latents[:, :, :-lag] for lag in range(1, min(new_frames + 1, latents.shape[2]))]
         return float(torch.stack([change.square().mean() for change in later]).mean().sqrt())
     given = latents[:, :, num_conditioning - 1 : num_conditioning]
     return float((latents[:, :, num_conditioning:] - given).square().mean().sqrt())
