@@ -11,6 +11,7 @@ from benchmarks.environments.roboscape import (
     ALL_SCENES,
     FIGURE_2,
     GOAL,
+    JUDGE,
     LABELS,
     MANY,
     MODEL,
@@ -44,7 +45,7 @@ OURS = "reach_object"
 PAYS = {
     MODEL: "done signal", REFRESHED: "done signal, refreshed",
     GOAL: "goal distance and done signal", PROGRESS: "golden progress and done signal",
-    "embedding": "embedding head (iVideoGPT)", "proxy": "proxy network (DiWA)",
+    JUDGE: "verdict of the reward agent", "embedding": "embedding head (iVideoGPT)", "proxy": "proxy network (DiWA)",
 }
 
 
@@ -135,14 +136,16 @@ def clones() -> Rows:
 
 def recoveries() -> Rows:
     """Beside the clones of Table 1 those of as many demonstrations more, or recoveries."""
-    tasks, groups = (*TASKS, OURS), dict[tuple[str, int, int], list[Run]]()
+    tasks, groups = (*TASKS, OURS), dict[tuple[str, int, int, str], list[Run]]()
     for row in (*(row for task in tasks for row in trained(SFT, task)), *read(RECOVERIES)["rows"]):
-        sft = row["config"]["sft"]
-        groups.setdefault((row["task"], sft["num_demonstrations"], sft.get("recoveries", 0)), []).append(row)
-    for task, count, more in sorted(groups, key=lambda one: (tasks.index(one[0]), one[1] + one[2], one)):
-        of = groups[task, count, more]
+        sft, gripper = row["config"]["sft"], "-1 or 1" if row["config"]["policy"].get("two_valued_actions") else ""
+        groups.setdefault(
+            (row["task"], sft["num_demonstrations"], sft.get("recoveries", 0), gripper), []
+        ).append(row)
+    for task, count, more, gripper in sorted(groups, key=lambda one: (tasks.index(one[0]), one[1] + one[2], one)):
+        of = groups[task, count, more, gripper]
         yield (
-            task, count, more or "", ", ".join(str(row["seed"]) for row in of),
+            task, count, more or "", gripper, ", ".join(str(row["seed"]) for row in of),
             *(by_seed([success_of(row, domain) for row in of]) for domain in DOMAINS),
         )
 

@@ -142,8 +142,9 @@ def as_written() -> Rows:
             *gained(trained, [("success", 3), ("outcome", 3)]),
         )
     first, *others = trainings
+    of_seed = {one["seed"]: one for one in trainings[first]}
     for other in others:
-        pairs = list(zip(trainings[first], trainings[other], strict=True))  # one seed each
+        pairs = [(of_seed[one["seed"]], one) for one in trainings[other]]
         apart = [
             t_interval([of_buffers(one, measure, LAST) - of_buffers(base, measure, LAST) for one, base in pairs])
             for measure in ("reward_mean", "rollout_diversity")

@@ -1,28 +1,30 @@
 """Rows of the tables of docs/results/video_tasks.md; what they are about stands in pages.yaml."""
 
-import math
-from statistics import mean, variance
+from statistics import mean
 
 from benchmarks.tables.table import Rows, Run, interval, lines, percent, points, read, runs
 from benchmarks.tables.video_rl import gained, over_seeds, samplers
 from benchmarks.video_rl.comparison import compare_samplers
-from wm_nodes.core.statistics import t_975
 
-OUTCOME, EARLY, JUDGED = (f"video_rl_outcome{of}.json" for of in ("", "_early", "_judge"))
-EXECUTED, MIXED = "video_rl_outcome_execution.json", "video_rl_outcome_mixed.json"
+OUTCOME, EARLY, REWARDS = (f"video_rl_outcome{of}.json" for of in ("", "_early", "_rewards"))
 CLOSED_LOOP, LONGER, TRAINED_IN = (f"video_rl_closed_loop{of}" for of in (".jsonl", "_history.json", "_policies.json"))
 BEFORE, AFTER_CPS, AFTER_RECORDINGS = (f"video model {of}" for of in ("before", "after CPS", "after recordings"))
-PROBE_PAID, JUDGE_PAID = "CPS 0.4", "CPS 0.4, judge robot"
+PROBE_PAID = "CPS 0.4"
+PAID_BY = {
+    "CPS 0.4, execution": "action world model", "CPS 0.4, execution and outcome": "and 0.3 of the outcome",
+    PROBE_PAID: "probe", "CPS 0.4, judge robot": "judge",
+}
+BEGIN, *_, LAST = MEASURED = ("0", "10", "20", "30")
+REAL = "executed_success"
 CHANGES = (("error_cm", 2), ("object_cm", 2), ("tool_cm", 2), ("psnr_db", 2))
 UNPAID = (
     ("executed_success", 3), ("executed_object_cm", 1), ("reader_success", 3), ("object_permanence", 3),
     ("impossible_tool_steps", 3),
 )
-ACCEPTED = ("accepted", "accepted_executed")
 
 
 def outcome() -> Rows:
-    for file, base in ((OUTCOME, ""), (EARLY, "early"), (JUDGED, "")):
+    for file, base in ((OUTCOME, ""), (EARLY, "early")):
         rows = read(file)["rows"]
         for name, trained in samplers(rows).items():
             ends = (percent(mean(one["evaluations"][place]["success"] for one in trained)) for place in (0, -1))
@@ -35,8 +37,7 @@ def outcome() -> Rows:
 
 
 def unpaid() -> Rows:
-    rows = [one for one in read(OUTCOME)["rows"] + read(JUDGED)["rows"] if "measured" in one]
-    for name, trained in samplers(rows).items():
+    for name, trained in samplers(read(OUTCOME)["rows"]).items():
         cells = []
         for metric, digits in UNPAID:
             before, after = ([one["measured"][when][metric] for one in trained] for when in ("0", "15"))
@@ -46,43 +47,41 @@ def unpaid() -> Rows:
 
 
 def executed() -> Rows:
-    rows = sorted(read(OUTCOME)["rows"] + read(JUDGED)["rows"], key=lambda one: int(one["seed"]))
-    judged = samplers(rows)[JUDGE_PAID]
-    judge, probe = ([one["measured"]["15"]["executed_success"] for one in samplers(rows)[name]]
-                    for name in (JUDGE_PAID, PROBE_PAID))
-    change, (a, b) = mean(judge) - mean(probe), (variance(some) / len(some) for some in (judge, probe))
-    freedom = (a + b) ** 2 / (a**2 / (len(judge) - 1) + b**2 / (len(probe) - 1))
-    half, cells = t_975(int(freedom)) * math.sqrt(a + b), []
-    for when in ("0", "15"):
-        accepted, real = (mean(one["measured"][when][key] for one in judged) for key in ACCEPTED)
-        cells += [percent(accepted), percent(real / accepted)]
-    first = probe[: len(judge)]
-    for paid_by, values, apart in (
-        ("judge", judge, interval(change, change - half, change + half, 3)), ("probe", probe, ""),
-        ("probe, first six", first, f"{mean(judge) - mean(first):+.3f}"),
-    ):
-        by_seed = ", ".join(f"{value:.2f}" for value in values)
-        yield paid_by, by_seed, f"{mean(values):.3f}", apart, *(cells if paid_by == "judge" else [""] * 4)
-
-
-def execution_paid() -> Rows:
-    paid, mixed = (read(file)["rows"] for file in (EXECUTED, MIXED))
-    probe = {one["seed"]: one["measured"]["15"] for one in read(OUTCOME)["rows"] if one["sampler"] == PROBE_PAID}
-    for name, trained, when in (
-        ("action world model, 15 buffers", paid, "15"), ("action world model, 20 buffers", paid, "20"),
-        ("and 0.3 of the outcome, 20 buffers", mixed, "20"), ("probe, 15 buffers", paid, ""),
-    ):
-        probes = [probe[one["seed"]] for one in trained]
-        after = [one["measured"][when] for one in trained] if when else probes
-        real = [one["executed_success"] for one in after]
-        gains = [now - one["measured"]["0"]["executed_success"] for now, one in zip(real, trained, strict=True)]
-        apart = [now - one["executed_success"] for now, one in zip(real, probes, strict=True)]
-        kinds = [mean(one.get(kind, math.nan) for one in after) for kind in ("success", "execution_success")]
+    rewards = samplers(read(REWARDS)["rows"])
+    probe = {one["seed"]: at(one, LAST, REAL) for one in rewards[PROBE_PAID]}
+    for name, paid_by in PAID_BY.items():
+        trained = sorted(rewards[name], key=lambda one: int(one["seed"]))
+        ends = {one["seed"]: at(one, LAST, REAL) for one in trained}
         yield (
-            name, ", ".join(f"{value:.2f}" for value in real), f"{mean(real):.3f}", over_seeds(gains, 3),
-            over_seeds(apart, 3) if when else "", *(f"{kind:.3f}" if math.isfinite(kind) else "" for kind in kinds),
-            f"{mean(one['executed_object_cm'] for one in after):.1f}",
+            paid_by, len(trained), *(f"{mean(at(one, buffers, REAL) for one in trained):.3f}" for buffers in MEASURED),
+            ", ".join(f"{real:.2f}" for real in ends.values()),
+            over_seeds([at(one, LAST, REAL) - at(one, BEGIN, REAL) for one in trained], 3),
+            "" if name == PROBE_PAID else over_seeds([real - probe[seed] for seed, real in ends.items()], 3),
         )
+
+
+def paid_and_real() -> Rows:
+    rewards = samplers(read(REWARDS)["rows"])
+    for name, paid_by in PAID_BY.items():
+        trained = rewards[name]
+        apart = (
+            " → ".join(f"{mean(at(one, buffers, imagined) - at(one, buffers, REAL) for one in trained):+.2f}"
+                       for buffers in MEASURED)
+            for imagined in ("success", "execution_success", "accepted")
+        )
+        shares = ([mean(at(one, LAST, name) for one in trained) for name in (said, f"{said}_executed")]
+                  for said in ("execution_success", "accepted"))
+        true = (f"{executed / said:.2f}" for said, executed in shares)
+        others = (
+            " → ".join(f"{mean(at(one, buffers, metric) for one in trained):.2f}" for buffers in (BEGIN, LAST))
+            for metric in ("reader_success", "object_permanence", "impossible_tool_steps")
+        )
+        yield paid_by, *apart, *true, *others
+
+
+def at(row: Run, buffers: str, metric: str) -> float:
+    """A held-out metric after so many buffers."""
+    return float(row["measured"][buffers][metric])
 
 
 def closed_loop() -> Rows:
