@@ -132,7 +132,9 @@ def train_by_verdicts(place: Workplace, policy: ImagePolicy, imagined: ImaginedE
     check_horizon(config.ppo.num_steps, imagined.spec.max_episode_steps)
     learner = make_learner(policy, config)
     for version in range(1, config.ppo.updates + 1):
-        rollout = collect_rollout(imagined, policy, RuleReward(), config.ppo.num_steps, config.seed, version)
+        rollout = collect_rollout(
+            imagined, policy, RuleReward(), config.ppo.num_steps, config.seed, version, config.ppo.envs_per_start
+        )
         learner.update(terminate_at_episode_end(paid_by_verdicts(rollout, imagined.spec.instruction, config)))
         yield rollout_statistics(rollout).success_rate
 

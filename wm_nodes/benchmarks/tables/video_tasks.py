@@ -40,7 +40,7 @@ def unpaid() -> Rows:
     for name, trained in samplers(read(OUTCOME)["rows"]).items():
         cells = []
         for metric, digits in UNPAID:
-            before, after = ([one["measured"][when][metric] for one in trained] for when in ("0", "15"))
+            before, after = ([at(one, buffers, metric) for one in trained] for buffers in (BEGIN, "15"))
             changed = over_seeds([later - first for first, later in zip(before, after, strict=True)], digits)
             cells.append(f"{mean(before):.{digits}f} {changed}")
         yield name, len(trained), *cells
