@@ -27,7 +27,6 @@ OPTIONS = {
     "--verbose",
     "check-video-model": "--video-model --context-bags --public --prompt --picture --size --lora-rank --preset "
     "--SECTION.KEY",
-    "seed-study": "--tasks --seeds --arms --preset --SECTION.KEY --device --model-dir --threads --out",
     "collect": "folder --tasks --episodes --first-seed --preset --SECTION.KEY --device",
     "view": "BAG|RUN_FOLDER --rate --loop --port",
     "rescore": "recording --reward --judge --judge-model --judge-key-env --rubric --json --config --model-dir "

@@ -18,7 +18,6 @@ MODEL = str(shipped_model("push_cube"))
         ["train-policy", "--preset", "smoke", "--run-dir", "run"],
         ["train-policy", "--preset", "smoke", "--from-scratch", "--run-dir", "run"],
         ["train-video-model", "--preset", "smoke", "--run-dir", "run"],
-        ["seed-study", "--preset", "smoke", "--out", "study"],
         ["judge", "calibrate", MODEL, "bag"],
     ],
     ids=" ".join,

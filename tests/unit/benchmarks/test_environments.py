@@ -25,6 +25,7 @@ from wm_nodes.core.files import file_sha256
 from wm_nodes.policy_rl.factories import UNTRAINED, make_policy
 from wm_nodes.policy_rl.initial_policy import start_files
 from wm_nodes.training.weights import save_weights
+from wm_nodes.world_model import load_model_folder
 
 SMALL = {"simulation.max_episode_steps": 12, "evaluation.episodes": 2}
 
@@ -128,6 +129,24 @@ def test_trained_in_prints_acceptance_keeps_refused_rows_and_trains_again_only_b
     assert rates == [row["config"]["ppo"]["learning_rate"], 1e-5]
     assert main([*words, "--sft.num_demonstrations", "3"]) == 2
     assert "were made with sft.num_demonstrations 4, not 3; take another folder" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.rendering
+def test_training_in_rounds_refreshes_the_model_and_reads_the_exploit_meter(tmp_path: Path) -> None:
+    model, file = make_model_folder(tmp_path / "model"), tmp_path / "rows.json"
+    assert main([
+        "benchmark", "trained-in", "--preset", "smoke", "--model-dir", str(model), "--seeds", "0", "--json", str(file),
+        "--work", str(tmp_path / "work"), "--model_refresh.num_rounds", "2", "--exploit_meter.every", "1",
+        "--exploit_meter.episodes", "2", "--evaluation.episodes", "2", "--simulation.max_episode_steps", "12",
+    ]) == 0
+    (row,) = json.loads(file.read_text(encoding="utf-8"))["rows"]
+    (refresh,), folder = row["refreshes"], tmp_path / "work" / "push_cube_0" / "rounds" / "1"
+    assert [reading["update"] for reading in row["exploit_meter"]] == [0, 1, 1, 2]
+    assert len(row["course"]) == 2 and {entry["name"] for entry in refresh["rows"]} >= {"done signal right"}
+    refreshed = load_model_folder(folder / "model").manifest["refreshed"]
+    assert refreshed[0]["episodes"] == 8, "4 of the policy and 4 scripted ones"
+    assert (folder / "starts.safetensors").exists()
 
 
 def test_a_policy_is_measured_in_an_environment_of_ones_own_with_what_that_measures_beside_success(

@@ -57,6 +57,13 @@ def truth(**values: float) -> FloatArray:
     return np.array([{**usual, **values}.get(name, 0.0) for name in GROUND_TRUTH_NAMES], np.float32)
 
 
+@pytest.mark.parametrize("task", TASKS)
+def test_policies_command_the_gripper_by_its_sign_where_it_opens_and_closes(task: str) -> None:
+    waypoints = simulator_part(task).waypoints(truth(object_x=0.6, goal_x=0.7))
+    grasps = len({waypoint[-1] for waypoint in waypoints}) > 1
+    assert load_config("fair_start", {"task": task}).policy.two_valued_actions == (("gripper",) if grasps else ())
+
+
 @pytest.mark.parametrize(
     ("task", "done", "spoiled"),
     [

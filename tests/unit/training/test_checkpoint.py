@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from wm_nodes.apps.seed_study import read_results
 from wm_nodes.training.checkpoint import (
     DamagedFileError,
     read_checkpoint,
@@ -60,9 +59,3 @@ def test_cut_weights_are_named(tmp_path: Path) -> None:
     cut(file, 100)
     with pytest.raises(WeightsError, match=rf"{re.escape(str(file))}: .*cut short"):
         load_weights_file(module, file)
-
-
-def test_a_cut_line_of_a_study_is_named(tmp_path: Path) -> None:
-    (tmp_path / "results.jsonl").write_text('{"task": "push"}\n{"task": "pu')
-    with pytest.raises(ValueError, match=r"results.jsonl, line 2 is cut short.*delete the line"):
-        read_results(tmp_path)

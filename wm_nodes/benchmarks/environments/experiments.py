@@ -3,10 +3,13 @@ ranks policies.
 """
 
 import argparse
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from benchmarks.environments.policies import (
@@ -26,7 +29,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.device import compute_device
 from wm_nodes.core.progress import tqdm
-from wm_nodes.core.statistics import bootstrap_mean
+from wm_nodes.core.statistics import bootstrap_mean, paired_difference
 from wm_nodes.environments.registry import make_environment
 from wm_nodes.policy_rl.factories import load_policy, make_policy
 from wm_nodes.policy_rl.validation.evaluation import evaluate
@@ -66,8 +69,6 @@ class InModels(Configured):
 
     video_models: tuple[Path, ...] = ()
     """Folders of video models that can be stepped."""
-    task: str = "push_cube"
-    """Of the policies."""
     work: Path = Path("runs/environments")
     """Folder of first frames and policies; what is there is kept."""
 
@@ -75,8 +76,8 @@ class InModels(Configured):
     def models(self) -> list[str]:
         return [WORLD_MODEL, *map(str, self.video_models)]
 
-    def workplace(self, seed: int) -> Workplace:
-        config = load_config(self.preset, {"task": self.task, **self.settings, "seed": seed})
+    def workplace(self, task: str, seed: int) -> Workplace:
+        config = load_config(self.preset, {"task": task, **self.settings, "seed": seed})
         compute_device(config.device)
         model_dir = self.model_dir or shipped_model(config.task)
         return Workplace(config, model_dir, self.work.absolute() / f"{config.task}_{seed}")
@@ -84,8 +85,11 @@ class InModels(Configured):
 
 @dataclass(kw_only=True)
 class TrainedIn(InModels):
-    """Train a policy in each model, measure it in the simulator. The task's world model is always the first of them."""
+    """Train a policy in each model, measure it in the simulator. The task's world model is always the first of them;
+    in it, by model_refresh and exploit_meter, too."""
 
+    tasks: tuple[str, ...] = ("push_cube",)
+    """Of the policies."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """A training in each model for each."""
     control: bool = False
@@ -95,22 +99,22 @@ class TrainedIn(InModels):
 
     def run(self) -> None:
         rows, scenes = self.read(), tuple(map(check_scenes, self.scenes))
-        for seed in self.seeds:
-            workplace = self.workplace(seed)
-            updates = workplace.config.ppo.updates
-            for model in [*self.models, *([SIMULATOR] if self.control else [])]:
-                if is_finished(rows, workplace.identity(model, scenes)):
-                    continue
-                with tqdm(total=updates, desc=f"{Path(model).name}, seed {seed}", unit="update") as bar:
-                    rows.append(train_in(workplace, model, scenes, bar.update))
-                self.write({"rows": rows})
-                if report := rows[-1]["acceptance"]:
-                    why = ", ".join(report["failed"] or report["undecided"])
-                    console.print(f"{Path(model).name}, seed {seed}: acceptance {report['outcome']} ({why})")
+        places = [self.workplace(task, seed) for task in self.tasks for seed in self.seeds]
+        for workplace, model in product(places, [*self.models, *([SIMULATOR] if self.control else [])]):
+            config = workplace.config
+            if is_finished(rows, workplace.identity(model, scenes)):
+                continue
+            words = f"{Path(model).name}, {config.task}, seed {config.seed}"
+            with tqdm(total=config.ppo.updates, desc=words, unit="update") as bar:
+                rows.append(train_in(workplace, model, scenes, bar.update))
+            self.write({"rows": rows})
+            if report := rows[-1]["acceptance"]:
+                why = ", ".join(report["failed"] or report["undecided"])
+                console.print(f"{words}: acceptance {report['outcome']} ({why})")
         columns = (
             "trained in", "task", "seed", "scenes", "real before", "real after", "gain", "imagined", "acceptance"
         )
-        lines = [line for row in rows for line in _lines(row)]
+        lines = [line for row in rows for line in _lines(row)] + _over_seeds(rows)
         console.print(make_table("policies trained in each model", columns, lines))
 
 
@@ -119,13 +123,15 @@ class Ranking(InModels):
     """Imagined success of policies in each model against their real success. The task's world model is always the first
     of the models."""
 
+    task: str = "push_cube"
+    """Of the policies."""
     policies: tuple[Path, ...]
     """Weights, 8 or more files."""
     seed: int = 0
     """Of the starts and of the bootstrap."""
 
     def run(self) -> None:
-        rows, workplace, models = self.read(), self.workplace(self.seed), self.models
+        rows, workplace, models = self.read(), self.workplace(self.task, self.seed), self.models
         for path in tqdm(self.policies, desc="policies", unit="policy"):
             wanted = {"policy": str(path), "config": workplace.config.model_dump(mode="json")}
             if not is_finished([row for row in rows if set(models) <= row["imagined"].keys()], wanted):
@@ -208,6 +214,26 @@ def _lines(row: dict[str, Any]) -> list[tuple[str, ...]]:
          *(("", "") if name else (imagined, _outcome(row))))
         for name, found in {"": first, **row.get("elsewhere", {})}.items()
     ]
+
+
+def _over_seeds(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
+    """A line for each model and task of the same settings with several seeds: the difference over all episodes."""
+    groups = dict[str, list[dict[str, Any]]]()
+    for row in rows:
+        groups.setdefault(json.dumps([row["model"], {**row["config"], "seed": ""}]), []).append(row)
+    lines = list[tuple[str, ...]]()
+    for of in groups.values():
+        if len(of) > 1:
+            before, after = (
+                [bool(won) for row in of for won in row[f"success_{when}"]] for when in ("before", "after")
+            )
+            pair, seeds = paired_difference(before, after), ", ".join(str(row["seed"]) for row in of)
+            lines.append((
+                of[0]["model"], of[0]["task"], seeds, "", f"{100 * fmean(before):.1f} % of {len(before)}",
+                f"{100 * fmean(after):.1f} % of {len(after)}",
+                f"{pair.difference:+.3f} ({pair.low:+.3f} to {pair.high:+.3f})", "", "",
+            ))
+    return lines
 
 
 def _percent(rate: dict[str, float]) -> str:

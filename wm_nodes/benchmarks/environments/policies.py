@@ -4,10 +4,10 @@ A model is the task's world model, or a video model that can be stepped, given b
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -21,6 +21,7 @@ from wm_nodes.core.model_folder import files_sha256
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.statistics import paired_difference, t_interval, wilson_interval
 from wm_nodes.core.types import Environment
+from wm_nodes.environments.registry import make_environment
 from wm_nodes.policy_rl.factories import (
     load_policy,
     make_endogenous_reward,
@@ -29,10 +30,12 @@ from wm_nodes.policy_rl.factories import (
 )
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import prepare_start
+from wm_nodes.policy_rl.model_refresh import Round, refresh_round, run_rounds, split_updates
 from wm_nodes.policy_rl.rollouts import rollout_statistics
 from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.policy_rl.validation.acceptance import accept_model
 from wm_nodes.policy_rl.validation.evaluation import EvaluationResult, evaluate
+from wm_nodes.policy_rl.validation.exploit_meter import ExploitMeter, make_exploit_meter
 from wm_nodes.reward import RewardModel, RuleReward
 from wm_nodes.training.weights import save_weights
 from wm_nodes.video_model.folder import read_video_manifest
@@ -75,16 +78,12 @@ class Workplace:
 
     @contextmanager
     def simulator(self, scenes: str = "", num_envs: int = SIMULATOR_ENVS) -> Iterator[Environment]:
-        """scenes: others than the configuration's."""
-        from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-
+        """The environment that policies are measured in. scenes: others than the configuration's."""
         config = self.config
         simulation = config.simulation.with_values(scenes=scenes or config.simulation.scenes)
-        env = ManiSkillEnvironment(config.task, simulation, num_envs, seed=config.seed)
-        try:
+        there, name = config.with_values(simulation=simulation), config.evaluation.environment
+        with closing(make_environment(there, name, num_envs=num_envs, seed=config.seed)) as env:
             yield env
-        finally:
-            env.close()
 
     def real(self, policy: ImagePolicy, scenes: str = "") -> EvaluationResult:
         """Success in the simulator, on the seeds of the configuration. scenes: others than the configuration's."""
@@ -118,7 +117,8 @@ class Workplace:
 def train_in(
     workplace: Workplace, model: str, scenes: Sequence[str] = (), on_update: Callable[[], object] = lambda: None
 ) -> dict[str, Any]:
-    """Train the weak policy of a seed in a model, whatever acceptance says of it; return the row of the table.
+    """Train the weak policy of a seed in a model, whatever acceptance says of it; return the row of the table. In the
+    world model, by all settings of model_refresh and exploit_meter.
 
     Every KEPT_EVERY-th version lies in workplace.folder / name of the model.
 
@@ -133,13 +133,23 @@ def train_in(
     accepted = None if model == SIMULATOR else workplace.acceptance(model, policy, before[1], before[0])
     elsewhere = {name: [workplace.real(policy, name)] for name in scenes}
     course, kept, seconds = list[float](), list[str](), time.monotonic()
-    for update, success_rate in enumerate(train_on(workplace, policy, None if model == SIMULATOR else env), 1):
+
+    def note(success_rate: float) -> None:
         course.append(success_rate)
+        update = len(course)
         if update % KEPT_EVERY == 0 or update == config.ppo.updates:
             path = workplace.folder / Path(model).name / f"policy_{update:06d}.safetensors"
             save_weights(policy, path, {"tokenizer_sha256": policy.encoder.sha256})
             kept.append(str(path))
         on_update()
+
+    rounds = Rounds(workplace.model_dir)
+    if model == WORLD_MODEL:
+        rounds = _train_in_rounds(workplace, policy, note)
+        env = replace(workplace, model_dir=rounds.model_dir).environment(model)
+    else:
+        for success_rate in train_on(workplace, policy, None if model == SIMULATOR else env):
+            note(success_rate)
     seconds = time.monotonic() - seconds
     after = workplace.real(policy), workplace.imagined(policy, env)
     for name, measured in elsewhere.items():
@@ -158,6 +168,7 @@ def train_in(
         },
         "success_before": before[0].success.astype(int).tolist(),
         "success_after": after[0].success.astype(int).tolist(),
+        "exploit_meter": rounds.readings, "refreshes": rounds.refreshes,
         "seconds_per_update": seconds / max(1, len(course)), "minutes": (time.monotonic() - began) / 60,
     }
 
@@ -177,9 +188,56 @@ def train_on(
         yield from _success_rates(policy, imagined, make_endogenous_reward(config, workplace.model_dir), config)
 
 
-def _success_rates(policy: ImagePolicy, env: Environment, reward: RewardModel, config: RunConfig) -> Iterator[float]:
-    for rollout, _ in train_policy(policy, env, reward, config):
+def _success_rates(
+    policy: ImagePolicy, env: Environment, reward: RewardModel, config: RunConfig, meter: ExploitMeter | None = None
+) -> Iterator[float]:
+    for rollout, _ in train_policy(policy, env, reward, config, meter):
         yield rollout_statistics(rollout).success_rate
+
+
+@dataclass
+class Rounds:
+    """What a training in the world model gave, beside the policy and its course."""
+
+    model_dir: Path
+    """The model that it ended in."""
+    readings: list[dict[str, float]] = field(default_factory=list)
+    """Rows of the exploit meter."""
+    refreshes: list[dict[str, Any]] = field(default_factory=list)
+    """The decision on each refreshed model."""
+
+
+def _train_in_rounds(workplace: Workplace, policy: ImagePolicy, note: Callable[[float], None]) -> Rounds:
+    """Train in place. note: gets the success rate of each update's rollout."""
+    config, first_frames, rounds = workplace.config, workplace.start[0], Rounds(workplace.model_dir)
+
+    def train(part: Round) -> bool:
+        env = make_imagined_environment(
+            part.config, part.model_dir, part.starts, num_envs=config.ppo.num_envs, seed=part.config.seed, training=True
+        )
+        meter = make_exploit_meter(part.config, part.model_dir, first_frames, simulator)
+        reward = make_endogenous_reward(part.config, part.model_dir)
+        for success_rate in _success_rates(policy, env, reward, part.config, meter):
+            note(success_rate)
+        made = sum(split_updates(config.ppo.updates, config.model_refresh.num_rounds)[: part.number - 1])
+        rounds.readings += [] if meter is None else [{**row, "update": row["update"] + made} for row in meter.rows()]
+        rounds.model_dir = part.model_dir
+        if part.last:
+            return False
+        weights = part.folder / "policy.safetensors"
+        weights.parent.mkdir(parents=True, exist_ok=True)
+        save_weights(policy, weights, {"tokenizer_sha256": policy.encoder.sha256})
+        decision = refresh_round(config, part.model_dir, weights, first_frames, workplace.folder, part.number)
+        rounds.refreshes.append(decision.to_dict())
+        return decision.accepted
+
+    with ExitStack() as stack:
+        @cache
+        def simulator() -> Environment:
+            return stack.enter_context(workplace.simulator())
+
+        run_rounds(config, workplace.folder, workplace.model_dir, first_frames, train)
+    return rounds
 
 
 def measure_policy(workplace: Workplace, weights: Path, models: Sequence[str]) -> dict[str, Any]:
@@ -240,6 +298,7 @@ def rate_of(result: EvaluationResult) -> dict[str, float]:
     return {"rate": result.success_rate, "successes": result.successes, "episodes": result.episodes, "low": low,
             "high": high}
 
+
 def rate_over_seeds(rates: Sequence[float]) -> str:
     """Mean of percentages, with its t interval (inside 0 to 100) where there are several; "-" for NaN."""
     text = f"{fmean(rates):.1f}".replace("nan", "-")
@@ -247,3 +306,20 @@ def rate_over_seeds(rates: Sequence[float]) -> str:
         return text
     over = t_interval(rates)
     return f"{text} ({max(0.0, over.low):.1f} to {min(100.0, over.high):.1f})"
+
+
+def mean_gain(rates: Mapping[tuple[str, str, str], float], training: str, baseline: str) -> float:
+    """Mean over policies and tasks of rate(training) - rate(baseline), in the unit of the rates, as RoboScape-R reports
+    it. rates: a success rate for each policy, training and task.
+
+    Raises:
+        ValueError: a cell that only one of the two trainings has, or none at all.
+    """
+    names = {name: {(policy, task) for policy, other, task in rates if other == name} for name in (training, baseline)}
+    alone = names[training] ^ names[baseline]
+    if alone or not names[training]:
+        raise ValueError(
+            f"{training!r} and {baseline!r} have been measured on different cells: {sorted(alone) or 'none'}; "
+            "leave out what has no fellow"
+        )
+    return fmean(rates[policy, training, task] - rates[policy, baseline, task] for policy, task in names[training])

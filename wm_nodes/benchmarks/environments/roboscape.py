@@ -15,10 +15,17 @@ from typing import Any, Literal, get_args
 from benchmarks.environments.experiments import Configured
 from benchmarks.environments.figures import draw_policies, extreme_table, measure_extreme
 from benchmarks.environments.learned_rewards import EMBEDDING, PROXY, Learned, environment_paid_by, train_by_verdicts
-from benchmarks.environments.policies import SIMULATOR, WORLD_MODEL, Workplace, rate_of, rate_over_seeds, train_on
+from benchmarks.environments.policies import (
+    SIMULATOR,
+    WORLD_MODEL,
+    Workplace,
+    mean_gain,
+    rate_of,
+    rate_over_seeds,
+    train_on,
+)
 from benchmarks.environments.reward_test import measure_rewards, rewards_table
 from benchmarks.experiment import Count, console
-from wm_nodes.apps.seed_study import mean_gain
 from wm_nodes.config.load import load_config
 from wm_nodes.config.scenes import draw, splits
 from wm_nodes.config.shipped import shipped_model

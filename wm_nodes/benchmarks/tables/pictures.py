@@ -12,7 +12,7 @@ def draw_tasks(path: Path) -> None:
     """Success of each task before and after training in the world model, beside imagined success and the control."""
     found = read(policy_rl.LIKELIHOOD)
     trained = [one for one in (*found["study"], *found["scenes"]) if one.get("advantage", "gae") == "gae"]
-    control = [one for one in lines(policy_rl.STUDY) if one["arm"] == "simulator"] + read(policy_rl.CONTROL)["rows"]
+    control = [one for one in lines(policy_rl.STUDY) if one["model"] == "simulator"] + read(policy_rl.CONTROL)["rows"]
     tasks = list(dict.fromkeys(one["task"] for one in trained))
     figure = make_figure(7, 3)
     axes = figure.subplots()

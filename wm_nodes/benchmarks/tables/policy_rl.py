@@ -66,7 +66,7 @@ def simulator_control() -> Rows:
     for task, last in (("push_cube", 2), ("push_cube", 4), ("reach", 4)):
         arms = ("world_model", "simulator") if last == 2 else ("world_model",)
         pooled = {
-            (arm, when): [x for one in rows if (one["task"], one["arm"]) == (task, arm) and one["seed"] <= last
+            (arm, when): [x for one in rows if (one["task"], one["model"]) == (task, arm) and one["seed"] <= last
                           for x in one[f"success_{when}"]] for arm in arms for when in ("before", "after")
         }
         rates = {key: percent(mean(successes)) for key, successes in pooled.items()}

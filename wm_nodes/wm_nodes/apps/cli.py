@@ -43,7 +43,6 @@ GROUPS = {
         "train-policy": "a policy in the world model, measured in the simulator",
         "train-video-model": "the video world model by GRPO on its own clips",
         "check-video-model": "whether a video model is fit to be trained so",
-        "seed-study": "several seeds and tasks: world model against simulator",
     },
     "recordings": {
         "collect": "episodes of tasks in the simulator, planned and scripted",

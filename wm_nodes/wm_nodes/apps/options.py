@@ -71,10 +71,6 @@ def add_run_dir(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_threads(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--threads", type=int, default=1, help="cores; other numbers give other last bits (default: 1)")
-
-
 def add_json(parser: argparse.ArgumentParser, about: str = "also write the numbers to this file") -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help=about)
 
@@ -190,7 +186,7 @@ def _full_paths(value: Any) -> Any:
     return value
 
 
-def prepare_torch(count: int | None = None) -> None:
-    """Let torch compute on `count` cores; None: on $OMP_NUM_THREADS of them, else on one. Freed memory is kept."""
+def prepare_torch() -> None:
+    """Let torch compute on $OMP_NUM_THREADS cores, else on one. Freed memory is kept."""
     keep_freed_memory()
-    torch.set_num_threads(count or int(os.environ.get("OMP_NUM_THREADS", "1")))
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))

@@ -157,7 +157,7 @@ def make_reward(config: RunConfig, model_dir: Path | None, *, golden: bool = Fal
     if config.reward.needs_golden and not golden:
         raise ValueError(
             "reward.mode progress compares with golden trajectories, and env/goal is one frame; train in one process "
-            "(wm seed-study, wm reproduce roboscape), or choose delta or abs, or set reward.dense_weight to 0"
+            "(wm reproduce roboscape, wm benchmark trained-in), or choose delta or abs, or set reward.dense_weight to 0"
         )
     return make_endogenous_reward(config, model_dir)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from wm_nodes.config.tasks import WeakPolicy
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill.table_top import CUBE, CUBE_START, GOAL
 
@@ -37,8 +38,15 @@ SETTINGS = {
 }
 """Of every task in these scenes. A rollout begins with a reset and is as long as an episode: what comes after it would
 never be trained on."""
+GRASPING = {"policy.two_valued_actions": ["gripper"]}
+"""Of tasks with a grasp."""
 ON_TABLE_M = 0.01
 """An object whose lowest point is below this lies on the table."""
+
+
+def weak_policies(number: int) -> tuple[WeakPolicy, ...]:
+    """Those of one task, 0 to 4: a better one that explores much, and a worse one that goes on after its misses."""
+    return WeakPolicy(number, 100, 0.25), WeakPolicy(number + len(MODEL_TASKS), 25, 0.1)
 
 
 def measure(scene: Any, start: FloatArray | None) -> FloatArray:

@@ -58,7 +58,8 @@ TASK = Task(
     success=success,
     parts=PARTS,
     settings={
-        **objects.SETTINGS, "data.behaviours": MOVING, "sft.num_demonstrations": 1500, "sft.num_iterations": 3000,
+        **objects.SETTINGS, **objects.GRASPING, "data.behaviours": MOVING, "sft.num_demonstrations": 1500,
+        "sft.num_iterations": 3000,
     },
     simulator=SimulatorPart(scene, measure, waypoints, script, actions="pose", instruct=instruct),
     model=ModelPart(tasks=PARTS, positions=objects.POSITIONS),

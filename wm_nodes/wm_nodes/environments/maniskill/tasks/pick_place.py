@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from wm_nodes.config.scenes import Scene
-from wm_nodes.config.tasks import JudgePart, ModelPart, SimulatorPart, Task, WeakPolicy
+from wm_nodes.config.tasks import JudgePart, ModelPart, SimulatorPart, Task
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
 from wm_nodes.environments.maniskill.layouts import ANYWHERE, CONTAINERS, Layout, draw, free_of
@@ -47,12 +47,12 @@ TASK = Task(
     instruction="pick up the object and place it in the container",
     ground_truth_names=objects.GROUND_TRUTH_NAMES,
     success=success,
-    settings={**objects.SETTINGS, "data.behaviours": CARRYING},
+    settings={**objects.SETTINGS, **objects.GRASPING, "data.behaviours": CARRYING},
     simulator=SimulatorPart(
         scene, objects.measure, place_waypoints, scripted(place_waypoints, speed=0.8), actions="pose", instruct=instruct
     ),
     model=ModelPart(
-        tasks=objects.MODEL_TASKS, positions=objects.WITH_GOAL, weak_policies=(WeakPolicy(1, 100, 0.25),)
+        tasks=objects.MODEL_TASKS, positions=objects.WITH_GOAL, weak_policies=objects.weak_policies(1)
     ),
     judge=JudgePart(object_height_m=objects.MIDDLE_M),
 )

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from wm_nodes.config.scenes import Scene
-from wm_nodes.config.tasks import WeakPolicy
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
 from wm_nodes.environments.maniskill.layouts import Layout
@@ -34,5 +33,5 @@ def instruct(scene: Scene) -> str:
 TASK = replace(
     push.TASK, instruction="pull the object towards the robot", success=success,
     simulator=replace(push.SIMULATOR, scene=scene, instruct=instruct),
-    model=replace(push.TASK.model, weak_policies=(WeakPolicy(4, 100, 0.25),)),
+    model=replace(push.TASK.model, weak_policies=objects.weak_policies(4)),
 )

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from wm_nodes.config.scenes import Scene
-from wm_nodes.config.tasks import JudgePart, ModelPart, SimulatorPart, Task, WeakPolicy
+from wm_nodes.config.tasks import JudgePart, ModelPart, SimulatorPart, Task
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
 from wm_nodes.environments.maniskill.layouts import CONTAINERS, Layout, Point, Rectangle, draw, free_of
@@ -65,7 +65,7 @@ TASK = Task(
     },
     simulator=SIMULATOR,
     model=ModelPart(
-        tasks=objects.MODEL_TASKS, positions=objects.POSITIONS, weak_policies=(WeakPolicy(2, 100, 0.25),)
+        tasks=objects.MODEL_TASKS, positions=objects.POSITIONS, weak_policies=objects.weak_policies(2)
     ),
     judge=JudgePart(object_height_m=objects.MIDDLE_M),
 )

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from wm_nodes.config.scenes import Scene
-from wm_nodes.config.tasks import JudgePart, ModelPart, SimulatorPart, Task, WeakPolicy
+from wm_nodes.config.tasks import JudgePart, ModelPart, SimulatorPart, Task
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
 from wm_nodes.environments.maniskill.layouts import ANYWHERE, CONTAINERS, Layout, Point, draw, free_of
@@ -56,7 +56,7 @@ TASK = Task(
     ),
     model=ModelPart(
         tasks=objects.MODEL_TASKS, positions=objects.POSITIONS, moves_object=False,
-        weak_policies=(WeakPolicy(3, 100, 0.25),),
+        weak_policies=objects.weak_policies(3),
     ),
     judge=JudgePart(object_height_m=objects.MIDDLE_M),
 )

@@ -1,9 +1,8 @@
-"""The headline number of the paper's Table 1 from its cells, and of the study's rows."""
-
+"""The headline number of the paper's Table 1 from its cells."""
 
 import pytest
 
-from wm_nodes.apps.seed_study import gain_over_simulator, mean_gain
+from benchmarks.environments.policies import mean_gain
 
 TASKS = ("pick and place", "push", "pull", "move to aim")
 IND = {
@@ -42,14 +41,3 @@ def test_a_cell_without_its_fellow_is_an_error() -> None:
         mean_gain(some, "world model", "simulator")
     with pytest.raises(ValueError, match="none"):
         mean_gain({}, "world model", "simulator")
-
-
-def row(task: str, arm: str, seed: int, successes: int) -> dict[str, object]:
-    return {"task": task, "arm": arm, "seed": seed, "real_after": {"successes": successes, "episodes": 200}}
-
-
-def test_the_study_compares_the_arms_on_the_seeds_that_both_have() -> None:
-    rows = [row("reach", "world_model", 0, 190), row("reach", "simulator", 0, 200), row("reach", "world_model", 1, 10),
-            row("push_cube", "world_model", 0, 160), row("push_cube", "simulator", 0, 180)]
-    assert gain_over_simulator(rows) == pytest.approx(-7.5)
-    assert gain_over_simulator(rows[:1]) is None
