@@ -1,10 +1,12 @@
 """The procedural scenes and their tasks in the simulator: control, repetition, pictures, rules, scripts."""
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from transforms3d.quaternions import mat2quat, qinverse, qmult, quat2axangle
 
 from wm_nodes.config.load import load_config
@@ -18,8 +20,18 @@ from wm_nodes.core.types import TAKEN_OVER, FloatArray, Observation
 from wm_nodes.environments.maniskill.behaviours import ROBOT_BASE
 from wm_nodes.environments.maniskill.control import DOWN
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-from wm_nodes.environments.maniskill.episodes import recovered_episode, scripted_episode
-from wm_nodes.environments.maniskill.objects import BOTTOM, GRASPED, GROUND_TRUTH_NAMES, OPENING
+from wm_nodes.environments.maniskill.episodes import SCATTERED, recovered_episode, scripted_episode
+from wm_nodes.environments.maniskill.layouts import ANYWHERE
+from wm_nodes.environments.maniskill.objects import (
+    BOTTOM,
+    CONTAINER,
+    GRASPED,
+    GROUND_TRUTH_NAMES,
+    OBJECT,
+    ON_TABLE_M,
+    OPENING,
+)
+from wm_nodes.environments.maniskill.table_top import TOOL
 
 TASKS = ("push", "pull", "pick_place", "move_to_aim", "reach_object")
 CONFIG = load_config("cpu", {"task": "pick_place"})
@@ -193,6 +205,26 @@ def test_the_script_of_a_task_succeeds_from_a_start_that_does_not(task: str) -> 
     with pytest.raises(ValueError, match=r"'dance'.*noisy"):
         scripted_episode(env, "dance", 1, 5)
     env.close()
+
+
+@pytest.mark.rendering
+def test_scattered_episodes_show_the_object_at_rest_elsewhere_at_every_step(env: ManiSkillEnvironment) -> None:
+    episode, again = (scripted_episode(env, SCATTERED, 7, number) for number in (0, 1))
+    assert_array_equal(episode.ground_truth, again.ground_truth)
+    places, tools = episode.ground_truth[1:, OBJECT], episode.ground_truth[1:, TOOL]
+    assert (np.abs(places[:, :2]) <= np.array(ANYWHERE[1]) + 0.01).all() and np.ptp(places[:, :2], 0).min() > 0.15
+    moved = np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1)
+    assert np.median(moved) > 0.03 and (episode.ground_truth[1:, BOTTOM] < ON_TABLE_M).mean() > 0.9
+    assert 0.2 < (np.linalg.norm((places - tools)[:, :2], axis=1) < 0.1).mean() < 0.9, "often near the tool"
+    container = episode.ground_truth[:, CONTAINER]
+    assert (np.linalg.norm(places[:, :2] - container[1:], axis=1) > 0.1).all()
+
+
+def test_the_cube_task_has_nothing_to_scatter() -> None:
+    simulation = load_config("cpu", {"task": "push_cube"}).simulation
+    with closing(ManiSkillEnvironment("push_cube", simulation, pictures=False)) as cube:
+        with pytest.raises(ValueError, match=r"push_cube has no procedural scene .* set data.num_scattered to 0"):
+            scripted_episode(cube, SCATTERED, 7, 0)
 
 
 @pytest.mark.rendering

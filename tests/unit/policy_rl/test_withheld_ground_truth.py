@@ -15,9 +15,10 @@ from wm_nodes.config.load import ConfigError, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.types import FloatArray
 from wm_nodes.policy_rl.factories import make_policy
-from wm_nodes.policy_rl.model_refresh import check_refreshable
+from wm_nodes.policy_rl.model_refresh import compare_models, refresh_model
 from wm_nodes.policy_rl.pretraining import load_arrays, make_model
 from wm_nodes.recording import EpisodeBagWriter
+from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.validation.acceptance import accept_world_model
 
@@ -93,8 +94,18 @@ def test_such_a_model_is_judged_by_pictures_also_where_the_simulator_knows_posit
     assert row.outcome == "failed", "twenty iterations show no square"
 
 
-def test_what_compares_or_collects_by_positions_refuses_with_the_remedy(bag: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"trained without ground truth.*set num_rounds to 1"):
-        check_refreshable(model_of(bag, settings(False), tmp_path))
+def test_it_is_refreshed_without_positions_and_compared_by_its_done_signal(bag: Path, tmp_path: Path) -> None:
+    config = settings(False, **{"model_refresh.refresh_iterations": 2})
+    source, other = model_of(bag, config, tmp_path / "run"), record(tmp_path / "other", exchanged)
+    refreshed = [refresh_model(config, source, [one], tmp_path / one.name / "model") for one in (bag, other)]
+    first, second = ((folder / "action_model.safetensors").read_bytes() for folder in refreshed)
+    assert first == second != (source / "action_model.safetensors").read_bytes()
+    models = [load_model_folder(folder) for folder in (source, refreshed[0])]
+    withheld = [replace(episode(seed), ground_truth=episode(seed).ground_truth[:, :0]) for seed in range(4)]
+    decision = compare_models(*models, stack_episodes(withheld, models[0].tasks), config)
+    assert [row.name for row in decision.rows] == ["done signal right"]
+
+
+def test_what_collects_by_positions_refuses_with_the_remedy(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"data\.ground_truth is false.*wm collect.*wm train-model"):
         make_model(settings(False, task="push_cube"), tmp_path / "run")

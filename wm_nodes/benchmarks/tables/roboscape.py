@@ -63,12 +63,19 @@ def table_1() -> Rows:
         if of := trained(training, task, inputs):
             papers = (PAPER.get((training, domain)) if task in TASKS else None for domain in DOMAINS)
             yield (
-                task, f"{inputs}, {of[0]['config']['sft']['num_demonstrations']}", LABELS[training],
+                task, f"{inputs}, {_shown_to(of[0])}", LABELS[training],
                 *(f"{fmean(success_of(row, domain) for row in of):.1f}" for domain in DOMAINS),
                 *(", ".join(f"{success_of(row, domain):.1f}" for row in of) for domain in DOMAINS),
                 ", ".join("yes" if row["accepted"] else "no" for row in of) if "accepted" in of[0] else "",
                 *("" if paper is None else paper[TASKS.index(task)] for paper in papers),
             )
+
+
+def _shown_to(row: Run) -> str:
+    """The demonstrations of a row's clone, and recoveries."""
+    sft = row["config"]["sft"]
+    more = sft.get("recoveries", 0)
+    return f"{sft['num_demonstrations']}{f' and {more} recoveries' if more else ''}"
 
 
 def table_1_gains() -> Rows:

@@ -281,7 +281,8 @@ def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, r
                 f"{', '.join(report.failed)} failed (numbers in {path}): training could only lower this policy; "
                 f"{GOOD_ALREADY}, or go on with --force"
             )
-        again = "--from-scratch --preset cpu_full" if config.task else "wm train-model"
+        preset = "scenes" if config.simulation.scenes else "cpu_full"
+        again = f"--from-scratch --preset {preset}" if config.task else "wm train-model"
         raise ModelNotAcceptedError(
             f"{', '.join(report.failed)} failed (numbers in {path}): the policy would learn to exploit the model. "
             f"Train the model longer or on more data ({again}), or go on with --force"

@@ -67,6 +67,9 @@ class SimulationConfig(SettingsSection):
 class DataConfig(SettingsSection):
     num_episodes: Annotated[int, Field(ge=1, le=250_000)]
     """Simulator episodes to collect for the world model."""
+    num_scattered: Annotated[int, Field(ge=0, le=100_000)]
+    """Further ones of each task of the procedural scenes, whose object is put elsewhere before every step: only
+    tokenizer and probes see them, and learn from them where things are."""
     num_heldout: Annotated[int, Field(ge=1, le=100_000)]
     """Episodes kept apart for the acceptance of the world model; never trained on."""
     behaviours: dict[str, NonNegativeFloat]

@@ -21,6 +21,7 @@ from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Episode, FloatArray, Observation
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.episodes import EXTREME as EXTREME
+from wm_nodes.environments.maniskill.episodes import SCATTERED as SCATTERED
 from wm_nodes.environments.maniskill.episodes import planned_or_scripted_episode, record_episode, recovered_episode
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner
 

@@ -6,7 +6,7 @@ and probe stay as they are, byte for byte: policies are tied to the tokenizer.
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,11 +22,10 @@ from wm_nodes.environments.collection import CollectionPlan
 from wm_nodes.environments.record import collect_plan, scripted_plan
 from wm_nodes.policy_rl.factories import STARTS, policy_actor
 from wm_nodes.policy_rl.initial_policy import write_round_starts
-from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.recording import read_episodes
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model import ActionModel, WorldModels, load_model_folder, save_refreshed_folder
-from wm_nodes.world_model.folder import model_spec, read_world_manifest
+from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.positions import judged_things
 from wm_nodes.world_model.training.dynamics import train_action_model
 from wm_nodes.world_model.validation.open_loop import episode_errors
@@ -85,17 +84,12 @@ class RefreshDecision:
 
 
 def check_refreshable(model_dir: Path) -> None:
-    """Raise ValueError for a model that cannot be refreshed: only a continuous action model with positions can."""
-    manifest = read_world_manifest(model_dir)
-    kind = manifest["tokenizer"]["kind"]
+    """Raise ValueError for a model that cannot be refreshed: only a continuous action model can."""
+    kind = read_world_manifest(model_dir)["tokenizer"]["kind"]
     if kind != "continuous":
         raise ValueError(
             f"{model_dir} has tokenizer.kind {kind}; rounds refresh continuous models only: set num_rounds to 1, or "
             "take a model made with tokenizer.kind=continuous"
-        )
-    if not model_spec(model_dir, manifest).ground_truth_names:
-        raise ValueError(
-            f"{model_dir} was trained without ground truth, and rounds compare models by positions: set num_rounds to 1"
         )
 
 
@@ -157,8 +151,7 @@ def refresh_model(config: RunConfig, model_dir: Path, bags: Sequence[Path], fold
     )
     action = copy.deepcopy(models.action)
     assert isinstance(action, ActionModel)
-    recorded = (episode for bag in bags for episode in read_episodes(bag))
-    episodes = stack_episodes(recorded, models.tasks, num_steps=config.simulation.max_episode_steps)
+    episodes = _episodes_for(models, bags, config)
     with explain_memory(device):
         action, metrics = train_action_model(
             models.tokenizer, episodes, training, config.seed + number, folder.with_name(f"{folder.name}_training"),
@@ -175,9 +168,17 @@ def refresh_model(config: RunConfig, model_dir: Path, bags: Sequence[Path], fold
     return folder
 
 
+def _episodes_for(models: WorldModels, bags: Sequence[Path], config: RunConfig) -> EpisodeArrays:
+    """The bags' episodes, labelled for the model's tasks; without ground truth where it learned from none."""
+    recorded = (episode for bag in bags for episode in read_episodes(bag))
+    if not models.spec.ground_truth_names:
+        recorded = (replace(episode, ground_truth=episode.ground_truth[:, :0]) for episode in recorded)
+    return stack_episodes(recorded, models.tasks, num_steps=config.simulation.max_episode_steps)
+
+
 def compare_models(old: WorldModels, new: WorldModels, heldout: EpisodeArrays, config: RunConfig) -> RefreshDecision:
-    """Compare both models on a policy's held-out real episodes: positions at the end, cm, and whether the done signal
-    is right.
+    """Compare both models on a policy's held-out real episodes: positions at the end, cm, where they know any, and
+    whether the done signal is right.
 
     Intervals: of errors by bootstrap over the episodes (stream of config.seed), of the done signal Tango's.
     """
@@ -189,7 +190,7 @@ def compare_models(old: WorldModels, new: WorldModels, heldout: EpisodeArrays, c
         for models in (old, new)
     )
     rows = []
-    for name in judged_things(config.task):
+    for name in judged_things(config.task) if heldout.ground_truth.shape[-1] else ():
         old_cm, new_cm = before[f"{name}_cm"], after[f"{name}_cm"]
         _, low, high = bootstrap_mean(new_cm - old_cm, seed=config.seed)
         rows.append(ModelComparison(f"{name} error, cm", float(old_cm.mean()), float(new_cm.mean()), low, high, True))
@@ -302,4 +303,4 @@ def refresh_round(
         config, model_dir, [*collect_replay(config, run_dir), *own], folder / "model", number=number
     )
     old, new = (load_model_folder(path, compute_device(config.device)) for path in (model_dir, refreshed))
-    return compare_models(old, new, load_arrays(heldout, config), config)
+    return compare_models(old, new, _episodes_for(old, heldout, config), config)

@@ -3,6 +3,7 @@
 import platform
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from datetime import date
 from functools import partial
 from itertools import chain
@@ -24,7 +25,7 @@ from wm_nodes.core.files import write_atomic
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.seeding import initial_weights
 from wm_nodes.core.specs import EnvironmentSpec, tool_spec
-from wm_nodes.environments.collection import EXTREME, POLICY_LABEL, CollectionPlan
+from wm_nodes.environments.collection import EXTREME, POLICY_LABEL, SCATTERED, CollectionPlan
 from wm_nodes.environments.record import collect_plan, collect_scripted, demonstration_plan
 from wm_nodes.policy_rl.factories import STARTS, policy_actor
 from wm_nodes.policy_rl.initial_policy import (
@@ -87,16 +88,23 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
         print(f"instructions are read by {reader.folder}, sha256 {reader.sha256[:12]}", file=sys.stderr)
     bags = collect_scripted(config, config.data.num_episodes, MODEL_EPISODES, run_dir / "data" / "train")
     spec = read_spec(next(chain(*bags.values())))
-    episodes = load_arrays(chain(*bags.values()), config)
+    seen = load_arrays(chain(*bags.values()), config)
+    if config.data.num_scattered:
+        seeds, where = replace(MODEL_EPISODES, first=config.data.num_episodes), run_dir / "data" / SCATTERED
+        scattered = collect_scripted(config, config.data.num_scattered, seeds, where, behaviour=SCATTERED)
+        seen = EpisodeArrays.concatenate([seen, load_arrays(chain(*scattered.values()), config)])
     with explain_memory(device, tokenizer__batch_size=config.tokenizer.batch_size):
-        tokenizer, tokenizer_metrics = train_tokenizer(episodes, config, config.seed, run_dir)
+        tokenizer, tokenizer_metrics = train_tokenizer(seen, config, config.seed, run_dir)
     if config.data.policy_episodes:
         policy_bags = _collect_policy_bags(config, run_dir, tokenizer, spec)
-        episodes = EpisodeArrays.concatenate([episodes, load_arrays(policy_bags, config)])
-    probe, probe_metrics = train_position_probe(episodes, config, config.seed, run_dir)
-    data = tokenise_episodes(tokenizer, episodes)
+        seen = EpisodeArrays.concatenate([seen, load_arrays(policy_bags, config)])
+    probe, probe_metrics = train_position_probe(seen, config, config.seed, run_dir)
     if config.tokenizer.probe_iterations:
-        tokenizer_metrics["probe"] = train_state_probe(tokenizer, data, config.tokenizer, config.seed, run_dir)["loss"]
+        latents = tokenise_episodes(tokenizer, seen)
+        read = train_state_probe(tokenizer, latents, config.tokenizer, config.seed, run_dir)
+        tokenizer_metrics["probe"] = read["loss"]
+    episodes = seen.select(np.flatnonzero(np.array(seen.behaviours) != SCATTERED))
+    data = tokenise_episodes(tokenizer, episodes)
     text, text_metrics = None, dict[str, float]()
     with explain_memory(device, world_model__batch_size=config.world_model.batch_size):
         action, shown_by, dynamics_metrics = _train_dynamics(tokenizer, data, spec, config, run_dir)

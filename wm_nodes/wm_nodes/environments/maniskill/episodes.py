@@ -21,18 +21,27 @@ EXTREME, HOLD_STEPS = "extreme", 4
 """The behaviour of every task that no world model is trained on: full-scale actions in random directions, each held for
 so many steps. A single one would hardly move the tool before the next takes it back."""
 
+SCATTERED = "scattered"
+"""The behaviour of episodes for what reads places off pictures: the tool wanders, and before every step the object is
+put elsewhere. Of tasks in the procedural scenes; no dynamics is to be learned from it."""
+
 
 def scripted_episode(env: ManiSkillEnvironment, behaviour: str, seed: int, episode_id: int) -> Episode:
     """One episode of a scripted behaviour; everything random follows from `seed`."""
+    if behaviour == SCATTERED and not hasattr(env.scene, "scatter"):
+        raise ValueError(f"task {env.spec.task} has no procedural scene whose object can be put elsewhere; leave "
+                         f"behaviour {SCATTERED} out, and set data.num_scattered to 0")
     env.reset(seeds=np.array([seed], np.uint64))
     truth, rng = env.ground_truth[0], numpy_stream(seed, "behaviour")
     script = simulator_part(env.spec.task).script
     scripted = (
         extreme_actions(rng, env.spec.action_dim) if behaviour == EXTREME
-        else script(behaviour, truth, rng, env.spec.action_scale[0])
+        else script("random" if behaviour == SCATTERED else behaviour, truth, rng, env.spec.action_scale[0])
     )
 
     def act(observation: Observation, truth_now: FloatArray) -> FloatArray:
+        if behaviour == SCATTERED:
+            env.scene.scatter(rng)
         return scripted(truth_now, observation.state[0, : env.spec.tool_dim])
 
     return record_episode(env, act, behaviour, seed, episode_id)

@@ -6,15 +6,23 @@ back, leave traces in PhysX: half of the episodes then depended on those before 
 
 from typing import Any
 
+import numpy as np
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.scene_builder.table import TableSceneBuilder
+from transforms3d.euler import euler2quat
 
 from wm_nodes.config.scenes import Scene, scene_of
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.environments.maniskill.layouts import Place
+from wm_nodes.environments.maniskill.layouts import ANYWHERE, Place, free_of
 from wm_nodes.environments.maniskill.scene_parts import COLOURS, build_carpet, build_container, build_object
+from wm_nodes.environments.maniskill.shape import get_shape
+
+NEAR_M = 0.1
+"""Along x and y, of an object that is put near the tool."""
+BESIDE_M, ABOVE_M = 0.07, 0.08
+"""It does not touch a tool that is so far beside, or so high above the table."""
 
 
 class ObjectScene(BaseEnv):  # type: ignore[misc]
@@ -61,6 +69,23 @@ class ObjectScene(BaseEnv):  # type: ignore[misc]
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
         self.table_scene.initialize(env_idx)
+
+    def scatter(self, rng: np.random.Generator) -> None:
+        """Put the object to rest elsewhere on the table, half of the times near the tool, never in its way."""
+        agent: Any = self.agent
+        tool = agent.tcp.pose.p[0].numpy()
+        while True:
+            place = rng.uniform(*ANYWHERE)
+            if rng.random() < 0.5:
+                place = np.clip(tool[:2] + rng.uniform(-NEAR_M, NEAR_M, 2), *ANYWHERE)
+            if free_of(self.layout.container, place, place) and (
+                tool[2] > ABOVE_M or np.linalg.norm(place - tool[:2]) > BESIDE_M
+            ):
+                break
+        height = get_shape(self.catalogue_scene.shape).rest_height_m
+        self.object.set_pose(sapien.Pose([*place, height], euler2quat(0, 0, rng.uniform(-np.pi, np.pi))))
+        self.object.set_linear_velocity(torch.zeros(3))
+        self.object.set_angular_velocity(torch.zeros(3))
 
     def evaluate(self) -> dict[str, Any]:
         return {}

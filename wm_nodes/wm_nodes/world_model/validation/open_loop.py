@@ -157,20 +157,23 @@ def episode_errors(
     threshold: float, probe: PositionProbe | None = None,
 ) -> dict[str, FloatArray]:
     """Of the rollout of each episode, (E,): error of the object and of the tool after its last step (object_cm,
-    tool_cm), and whether the done signal exceeds `threshold` if and only if the episode succeeds (done_right, bool), in
-    `task` or, where that has parts, in the task it was recorded for.
+    tool_cm; not without ground truth), and whether the done signal exceeds `threshold` if and only if the episode
+    succeeds (done_right, bool), in `task` or, where that has parts, in the task it was recorded for.
     """
     imagined, rows = imagine_episodes(tokenizer, model, episodes), np.arange(len(episodes))
+    own = [episodes.tasks.index(task if task in episodes.tasks else name) for name in episodes.recorded_tasks]
+    signal, happened = _done(imagined, episodes, own)
+    right = {"done_right": (signal > threshold) == happened}
+    if not episodes.ground_truth.shape[-1]:
+        return right
     last = imagined.frames[rows, episodes.lengths - 1][:, None]
     estimate = position_reader(tokenizer, probe)(last)[:, 0]
     truth = episode_targets(episodes)[rows, episodes.lengths]
-    own = [episodes.tasks.index(task if task in episodes.tasks else name) for name in episodes.recorded_tasks]
-    signal, happened = _done(imagined, episodes, own)
     errors = {
         f"{name}_cm": 100 * np.linalg.norm(estimate[:, columns] - truth[:, columns], axis=-1)
         for name in ("object", "tool") if (columns := columns_of(episodes.tasks[0], name))
     }
-    return {**errors, "done_right": (signal > threshold) == happened}
+    return errors | right
 
 
 def _done(
