@@ -10,6 +10,7 @@ import torch
 from wm_nodes.config.load import load_config
 from wm_nodes.core.device import DeviceError
 from wm_nodes.environments import collection
+from wm_nodes.environments.collection import SCATTERED
 from wm_nodes.environments.registry import configured_spec
 from wm_nodes.policy_rl import pretraining
 from wm_nodes.policy_rl.pretraining import _make_tokenizer_folder, make_model
@@ -69,7 +70,8 @@ def test_a_model_from_scratch_is_collected_in_parallel_and_resumed_where_it_stop
 @pytest.mark.slow
 @pytest.mark.rendering
 def test_one_model_is_made_of_the_episodes_of_several_tasks_and_measured_on_every_split(tmp_path: Path) -> None:
-    small = {"data.num_episodes": 2, "data.num_heldout": 1, "tokenizer.num_iterations": 2, "data.num_workers": 1}
+    small = {"data.num_episodes": 2, "data.num_heldout": 1, "tokenizer.num_iterations": 2, "data.num_workers": 1,
+             "data.num_scattered": 1, "tokenizer.probe_iterations": 2}
     config = load_config("smoke", {
         "task": "push", "data.behaviours": {"expert": 1.0}, "world_model.num_iterations": 2,
         "simulation.max_episode_steps": 12, **small,
@@ -84,6 +86,8 @@ def test_one_model_is_made_of_the_episodes_of_several_tasks_and_measured_on_ever
     recorded = {path.parent.name: path for path in (tmp_path / "data" / "train").glob("*/shard_*")}
     behaviours = {task: {e.behaviour for e in read_episodes(bag)} for task, bag in recorded.items()}
     assert set(recorded) == set(models.tasks) and behaviours["push"] == {"expert"} != behaviours["pick_place"]
+    scattered = [one for bag in (tmp_path / "data" / SCATTERED).glob("*/shard_*") for one in read_episodes(bag)]
+    assert {(one.task, one.behaviour, one.seed) for one in scattered} == {(task, SCATTERED, 2) for task in models.tasks}
     assert len(load_starts(folder / "starts.safetensors")[0]) == 10
     assert len(load_starts(folder / "starts.safetensors", "push")[0]) == 2
     with pytest.raises(ValueError, match="has starts of move_to_aim, pick_place, pull, push, reach_object, none of"):

@@ -109,8 +109,8 @@ class TrainedIn(InModels):
                 rows.append(train_in(workplace, model, scenes, bar.update))
             self.write({"rows": rows})
             if report := rows[-1]["acceptance"]:
-                why = ", ".join(report["failed"] or report["undecided"])
-                console.print(f"{words}: acceptance {report['outcome']} ({why})")
+                why = f" ({', '.join(names)})" if (names := report["failed"] or report["undecided"]) else ""
+                console.print(f"{words}: acceptance {report['outcome']}{why}")
         columns = (
             "trained in", "task", "seed", "scenes", "real before", "real after", "gain", "imagined", "acceptance"
         )

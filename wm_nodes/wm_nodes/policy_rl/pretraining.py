@@ -103,7 +103,9 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
         latents = tokenise_episodes(tokenizer, seen)
         read = train_state_probe(tokenizer, latents, config.tokenizer, config.seed, run_dir)
         tokenizer_metrics["probe"] = read["loss"]
-    episodes = seen.select(np.flatnonzero(np.array(seen.behaviours) != SCATTERED))
+    episodes = seen
+    if config.data.num_scattered:
+        episodes = seen.select(np.flatnonzero(np.array(seen.behaviours) != SCATTERED))
     data = tokenise_episodes(tokenizer, episodes)
     text, text_metrics = None, dict[str, float]()
     with explain_memory(device, world_model__batch_size=config.world_model.batch_size):
