@@ -166,10 +166,12 @@ def extreme() -> Rows:
 def no_positions() -> Rows:
     for row in read(UNAIDED)["rows"]:
         imagined = [100 * row["course"][place] for place in (0, -1)] if row["course"] else []
+        report = row.get("acceptance", {})
+        why = ", ".join(report.get("failed") or report.get("undecided", []))
         yield (
             LABELS[row["model"]], *(f"{success_of(row, domain):.1f}" for domain in DOMAINS),
             " → ".join(f"{rate:.1f}" for rate in imagined),
-            f"{row['acceptance']['outcome']}: {', '.join(row['acceptance']['failed'])}" if "acceptance" in row else "",
+            f"{report['outcome']}: {why}" if report else "",
         )
 
 
