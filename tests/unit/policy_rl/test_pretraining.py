@@ -87,6 +87,7 @@ def test_one_model_is_made_of_the_episodes_of_several_tasks_and_measured_on_ever
     behaviours = {task: {e.behaviour for e in read_episodes(bag)} for task, bag in recorded.items()}
     assert set(recorded) == set(models.tasks) and behaviours["push"] == {"expert"} != behaviours["pick_place"]
     scattered = [one for bag in (tmp_path / "data" / SCATTERED).glob("*/shard_*") for one in read_episodes(bag)]
+    assert (story["data"]["scattered_episodes"], story["data"]["training_seeds"]) == (5, [[0, 2]])
     assert {(one.task, one.behaviour, one.seed) for one in scattered} == {(task, SCATTERED, 2) for task in models.tasks}
     assert len(load_starts(folder / "starts.safetensors")[0]) == 10
     assert len(load_starts(folder / "starts.safetensors", "push")[0]) == 2

@@ -89,9 +89,10 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
     bags = collect_scripted(config, config.data.num_episodes, MODEL_EPISODES, run_dir / "data" / "train")
     spec = read_spec(next(chain(*bags.values())))
     seen = load_arrays(chain(*bags.values()), config)
-    if config.data.num_scattered:
-        seeds, where = replace(MODEL_EPISODES, first=config.data.num_episodes), run_dir / "data" / SCATTERED
-        scattered = collect_scripted(config, config.data.num_scattered, seeds, where, behaviour=SCATTERED)
+    count, after = config.data.num_scattered, config.data.num_episodes
+    if count:
+        where = run_dir / "data" / SCATTERED
+        scattered = collect_scripted(config, count, replace(MODEL_EPISODES, first=after), where, behaviour=SCATTERED)
         seen = EpisodeArrays.concatenate([seen, load_arrays(chain(*scattered.values()), config)])
     with explain_memory(device, tokenizer__batch_size=config.tokenizer.batch_size):
         tokenizer, tokenizer_metrics = train_tokenizer(seen, config, config.seed, run_dir)
@@ -101,11 +102,12 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
     probe, probe_metrics = train_position_probe(seen, config, config.seed, run_dir)
     if config.tokenizer.probe_iterations:
         latents = tokenise_episodes(tokenizer, seen)
-        read = train_state_probe(tokenizer, latents, config.tokenizer, config.seed, run_dir)
-        tokenizer_metrics["probe"] = read["loss"]
-    episodes = seen
-    if config.data.num_scattered:
-        episodes = seen.select(np.flatnonzero(np.array(seen.behaviours) != SCATTERED))
+        tokenizer_metrics["probe"] = train_state_probe(
+            tokenizer, latents, config.tokenizer, config.seed, run_dir
+        )["loss"]
+        del latents
+    episodes = seen.select(np.flatnonzero(np.array(seen.behaviours) != SCATTERED)) if count else seen
+    del seen  # gigabytes
     data = tokenise_episodes(tokenizer, episodes)
     text, text_metrics = None, dict[str, float]()
     with explain_memory(device, world_model__batch_size=config.world_model.batch_size):
@@ -120,7 +122,8 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
         "made": _made(command, config),
         "data": {
             "episodes": len(episodes), "policy_episodes": episodes.behaviours.count(POLICY_LABEL),
-            "training_seeds": seed_spans(episodes.seeds),
+            "scattered_episodes": len(bags) * count,
+            "training_seeds": seed_spans((*episodes.seeds, *range(after, after + count))),
             "behaviours": config.data.behaviours,
             "heldout_seeds": [[HELDOUT.first, HELDOUT.first + config.data.num_heldout - 1]],
         },
