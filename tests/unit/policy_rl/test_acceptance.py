@@ -40,14 +40,14 @@ def test_a_model_is_judged_by_held_out_episodes_and_by_the_cloned_policy_in_it(t
     kinds = [name.split(",")[0].split(" (")[0] for name in (row.name for row in report.criteria)]
     assert kinds == [
         "object error / copying", "tool error / copying", "done precision on rollouts", "done recall on rollouts",
-        "done precision", "done recall", "room to learn: done precision", "SFT policy: imagined 2/8 - real 2/8 success",
+        "done precision", "done recall", "SFT policy: imagined 2/8 - real 2/8 success",
     ]
     assert report.outcome == "failed" and report.episodes == 4 and "SFT" in report.undecided[-1]
     assert accept_model(CONFIG, model, policy, (2, 8), (2, 8), folder).to_dict() == report.to_dict()
 
     video = make_stepped_folder(tmp_path / "video_model")
     own = accept_model(CONFIG, model, policy, (2, 8), (2, 8), folder, video_model_dir=video)
-    assert len(own.criteria) == 4 and own.episodes == 0
+    assert len(own.criteria) == 3 and own.episodes == 0
     off = CONFIG.with_values(acceptance=CONFIG.acceptance.with_values(clone_episodes=0))
     assert len(accept_model(off, model, policy, (2, 8), (2, 8), folder).criteria) == 5
     smaller = CONFIG.with_values(data=CONFIG.data.with_values(behaviours={"random": 1.0}))

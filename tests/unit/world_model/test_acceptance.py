@@ -171,7 +171,6 @@ def test_a_model_that_only_scripted_episodes_speak_for_is_refused_by_the_cloned_
         ((91, 100), clone(46, 13, 3), "failed"),
         ((70, 100), clone(46, 13, 3), "passed"),
         ((70, 100), clone(3, 1, 3), "undecided"),
-        ((17, 100), clone(1, 7, 2), "undecided"),  # 12 % of eight: RL from this clone won 59 points
         ((70, 100), clone(0, 0, 3), "undecided"),
     ],
 )
@@ -181,6 +180,11 @@ def test_a_policy_that_the_model_could_only_lower_is_not_trained_in_it(
     criteria, _ = apply_criteria(GOOD, settings(), 16, (90, 100), real, found)
     room = next(row for row in criteria if row.name.startswith("room to learn"))
     assert room.outcome == outcome and f"{real[0]}/{real[1]}" in room.name and "keep this policy" in room.remedy
+
+
+def test_a_policy_that_mostly_fails_has_nothing_to_keep() -> None:
+    criteria, _ = apply_criteria(GOOD, settings(), 16, (90, 100), (32, 100), clone(2, 10, 3))
+    assert not [row for row in criteria if row.name.startswith("room to learn")], "RL in the model won 19 points"
 
 
 def test_intervals_of_the_held_out_numbers_stand_beside_them() -> None:

@@ -243,7 +243,7 @@ def _policy_criteria(
             _of_clone("precision", clone.replayed[clone.imagined], limits.done_precision, config, MORE_NEAR_MISSES),
             _of_clone("recall", clone.imagined[clone.replayed], limits.done_recall, config, MORE_SUCCESSES),
         ]
-        if real is not None:
+        if real is not None and 2 * real[0] >= real[1]:
             criteria.append(_room(clone.replayed[clone.imagined], real, limits.success_margin))
     if not limits.require_success_agreement:
         notes.append("Agreement of imagined and real success was not asked for (acceptance.require_success_agreement).")
@@ -269,9 +269,10 @@ def _agreement(imagined: tuple[int, int], real: tuple[int, int], margin: float) 
 
 
 def _room(right: BoolArray, real: tuple[int, int], margin: float) -> Criterion:
-    """Whether training can raise the policy: RL turns it to what the model calls a success, so that its real success
-    goes towards the share of its imagined successes that are real. It fails where that share is lower than what it has
-    and the interval leaves no gain above the margin, so that a good policy is kept; few episodes decide nothing."""
+    """Whether training can raise a policy that mostly succeeds: RL turns it to what the model calls a success, so that
+    its real success goes towards the share of its imagined successes that are real. It fails where that share is lower
+    than what it has and the interval leaves no gain above the margin, so that a good policy is kept; few episodes
+    decide nothing. A weaker policy is far from there: RL raised such against this rule (docs/results/policy_rl.md)."""
     gap = float(right.mean()) - real[0] / real[1] if len(right) else math.nan
     low, high = newcombe_difference(int(right.sum()), len(right), *real)
     outcome: Outcome = "undecided"
