@@ -229,8 +229,8 @@ def _over_seeds(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
             )
             pair, seeds = paired_difference(before, after), ", ".join(str(row["seed"]) for row in of)
             lines.append((
-                of[0]["model"], of[0]["task"], seeds, "", f"{100 * fmean(before):.1f} % of {len(before)}",
-                f"{100 * fmean(after):.1f} % of {len(after)}",
+                of[0]["model"], of[0]["task"], seeds, "",
+                *(_percent({"rate": fmean(won), "episodes": len(won)}) for won in (before, after)),
                 f"{pair.difference:+.3f} ({pair.low:+.3f} to {pair.high:+.3f})", "", "",
             ))
     return lines

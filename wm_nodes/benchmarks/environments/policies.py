@@ -24,8 +24,8 @@ from wm_nodes.core.types import Environment
 from wm_nodes.environments.registry import make_environment
 from wm_nodes.policy_rl.factories import (
     load_policy,
-    make_endogenous_reward,
     make_imagined_environment,
+    make_reward,
     make_video_environment,
 )
 from wm_nodes.policy_rl.image_policy import ImagePolicy
@@ -36,7 +36,7 @@ from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.policy_rl.validation.acceptance import accept_model
 from wm_nodes.policy_rl.validation.evaluation import EvaluationResult, evaluate
 from wm_nodes.policy_rl.validation.exploit_meter import ExploitMeter, make_exploit_meter
-from wm_nodes.reward import RewardModel, RuleReward
+from wm_nodes.reward import RewardModel
 from wm_nodes.training.weights import save_weights
 from wm_nodes.video_model.folder import read_video_manifest
 from wm_nodes.world_model import ImaginedEpisodes
@@ -183,9 +183,9 @@ def train_on(
     config = workplace.config
     if imagined is None:
         with workplace.simulator(scenes) as env:
-            yield from _success_rates(policy, env, RuleReward(), config)
+            yield from _success_rates(policy, env, make_reward(config, None), config)
     else:
-        yield from _success_rates(policy, imagined, make_endogenous_reward(config, workplace.model_dir), config)
+        yield from _success_rates(policy, imagined, make_reward(config, workplace.model_dir, golden=True), config)
 
 
 def _success_rates(
@@ -216,7 +216,7 @@ def _train_in_rounds(workplace: Workplace, policy: ImagePolicy, note: Callable[[
             part.config, part.model_dir, part.starts, num_envs=config.ppo.num_envs, seed=part.config.seed, training=True
         )
         meter = make_exploit_meter(part.config, part.model_dir, first_frames, simulator)
-        reward = make_endogenous_reward(part.config, part.model_dir)
+        reward = make_reward(part.config, part.model_dir, golden=True)
         for success_rate in _success_rates(policy, env, reward, part.config, meter):
             note(success_rate)
         made = sum(split_updates(config.ppo.updates, config.model_refresh.num_rounds)[: part.number - 1])

@@ -100,15 +100,13 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
         policy_bags = _collect_policy_bags(config, run_dir, tokenizer, spec)
         seen = EpisodeArrays.concatenate([seen, load_arrays(policy_bags, config)])
     probe, probe_metrics = train_position_probe(seen, config, config.seed, run_dir)
+    episodes, data = seen, tokenise_episodes(tokenizer, seen)
     if config.tokenizer.probe_iterations:
-        latents = tokenise_episodes(tokenizer, seen)
-        tokenizer_metrics["probe"] = train_state_probe(
-            tokenizer, latents, config.tokenizer, config.seed, run_dir
-        )["loss"]
-        del latents
-    episodes = seen.select(np.flatnonzero(np.array(seen.behaviours) != SCATTERED)) if count else seen
+        tokenizer_metrics["probe"] = train_state_probe(tokenizer, data, config.tokenizer, config.seed, run_dir)["loss"]
+    if count:
+        episodes = seen.select(np.flatnonzero(np.array(seen.behaviours) != SCATTERED))
+        data = tokenise_episodes(tokenizer, episodes)
     del seen  # gigabytes
-    data = tokenise_episodes(tokenizer, episodes)
     text, text_metrics = None, dict[str, float]()
     with explain_memory(device, world_model__batch_size=config.world_model.batch_size):
         action, shown_by, dynamics_metrics = _train_dynamics(tokenizer, data, spec, config, run_dir)
