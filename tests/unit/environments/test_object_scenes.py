@@ -3,14 +3,18 @@
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from numpy.testing import assert_array_equal
 from transforms3d.quaternions import mat2quat, qinverse, qmult, quat2axangle
 
 from wm_nodes.config.load import load_config
+from wm_nodes.config.object_state import READER
 from wm_nodes.config.scenes import SCENES, scene_of
+from wm_nodes.config.schema import TRUTH
 from wm_nodes.config.seed_ranges import HELDOUT, MODEL_EPISODES
 from wm_nodes.config.tasks import get_task, simulator_part, success
 from wm_nodes.core.rotations import multiply, to_quaternion
@@ -30,8 +34,13 @@ from wm_nodes.environments.maniskill.objects import (
     OBJECT,
     ON_TABLE_M,
     OPENING,
+    STARTS,
+    STATE,
 )
 from wm_nodes.environments.maniskill.table_top import TOOL
+from wm_nodes.environments.object_reader import ObjectReader
+from wm_nodes.environments.registry import configured_spec
+from wm_nodes.training.weights import save_weights
 
 TASKS = ("push", "pull", "pick_place", "move_to_aim", "reach_object")
 CONFIG = load_config("cpu", {"task": "pick_place"})
@@ -218,6 +227,44 @@ def test_scattered_episodes_show_the_object_at_rest_elsewhere_at_every_step(env:
     assert 0.2 < (np.linalg.norm((places - tools)[:, :2], axis=1) < 0.1).mean() < 0.9, "often near the tool"
     container = episode.ground_truth[:, CONTAINER]
     assert (np.linalg.norm(places[:, :2] - container[1:], axis=1) > 0.1).all()
+
+
+def states_of(object_state: str, steps: int, *, pictures: bool = True) -> tuple[ManiSkillEnvironment, FloatArray]:
+    """A closed environment of push, and its states (T, S) at the reset and after steps."""
+    simulation = CONFIG.simulation.with_values(object_state=object_state)
+    with closing(ManiSkillEnvironment("push", simulation, pictures=pictures)) as env:
+        states = [env.reset(seeds=np.array([3], np.uint64)).state[0]]
+        down = np.array([[0.5, 0, -1, 0, 0, 0, 0]], np.float32)
+        states += [env.step(down).observation.state[0] for _ in range(steps)]
+    return env, np.stack(states)
+
+
+def test_the_state_says_where_things_are_in_the_base_frame() -> None:
+    env, states = states_of(TRUTH, 2, pictures=False)
+    named = dict(zip(env.spec.state_names, states.T, strict=True))
+    truths = env.ground_truth[0], env._first_truth[0]
+    now, begun = (dict(zip(GROUND_TRUTH_NAMES, truth, strict=True)) for truth in truths)
+    for name in STATE:
+        base = ROBOT_BASE["xyz".index(name[-1])]
+        hidden = name.startswith("goal_")  # no carpet shows it
+        assert named[name][-1] == pytest.approx(0 if hidden else now[name] - base, abs=1e-6)
+        assert named[name][0] == pytest.approx(0 if hidden else begun[name] - base, abs=1e-6)
+    assert env.spec.commanded_dim == 7 and np.ptp(named["tool_target_z"]) > 0.1
+
+
+def test_a_reader_reads_the_state_and_the_start_is_what_it_read_at_the_reset(tmp_path: Path) -> None:
+    spec = configured_spec(load_config("cpu", {"task": "push", "simulation.object_state": TRUTH}))
+    torch.manual_seed(0)
+    reader = ObjectReader(spec)
+    save_weights(reader, tmp_path / READER)
+    env, states = states_of(str(tmp_path / READER), 2)
+    named, last = dict(zip(spec.state_names, states.T, strict=True)), env.current()
+    read = reader.fill(last.image, last.state)[0]
+    for name in ("object_x", "container_y", "goal_x"):
+        assert named[name][-1] == pytest.approx(read[spec.state_names.index(name)], abs=1e-5)
+    for name in STARTS:
+        assert (named[name] == named[name.replace("start_", "")][0]).all()
+    assert np.isnan(states_of(str(tmp_path / READER), 1, pictures=False)[1][:, 7:]).all()
 
 
 def test_the_cube_task_has_nothing_to_scatter() -> None:

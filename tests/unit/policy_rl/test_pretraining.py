@@ -8,9 +8,11 @@ import pytest
 import torch
 
 from wm_nodes.config.load import load_config
+from wm_nodes.config.object_state import READER
 from wm_nodes.core.device import DeviceError
 from wm_nodes.environments import collection
 from wm_nodes.environments.collection import SCATTERED
+from wm_nodes.environments.object_reader import load_object_reader
 from wm_nodes.environments.registry import configured_spec
 from wm_nodes.policy_rl import pretraining
 from wm_nodes.policy_rl.pretraining import _make_tokenizer_folder, make_model
@@ -23,7 +25,7 @@ def test_the_untrained_model_beside_a_tokenizer_is_that_of_the_seed(tmp_path: Pa
     tokenizer = Tokenizer(config.tokenizer, 64, 128)
     for name in ("a", "b"):
         torch.rand(5)
-        folder = _make_tokenizer_folder(config, tmp_path / name, tokenizer, configured_spec(config))
+        folder = _make_tokenizer_folder(config, tmp_path / name, tokenizer, configured_spec(config), torch.zeros(2, 3))
         files.append((folder / "action_model.safetensors").read_bytes())
     assert files[0] == files[1]
 
@@ -71,7 +73,7 @@ def test_a_model_from_scratch_is_collected_in_parallel_and_resumed_where_it_stop
 @pytest.mark.rendering
 def test_one_model_is_made_of_the_episodes_of_several_tasks_and_measured_on_every_split(tmp_path: Path) -> None:
     small = {"data.num_episodes": 2, "data.num_heldout": 1, "tokenizer.num_iterations": 2, "data.num_workers": 1,
-             "data.num_scattered": 1, "tokenizer.probe_iterations": 2}
+             "data.num_scattered": 1, "tokenizer.probe_iterations": 2, "world_model.object_reader_iterations": 2}
     config = load_config("smoke", {
         "task": "push", "data.behaviours": {"expert": 1.0}, "world_model.num_iterations": 2,
         "simulation.max_episode_steps": 12, **small,
@@ -80,6 +82,8 @@ def test_one_model_is_made_of_the_episodes_of_several_tasks_and_measured_on_ever
     models, story = load_model_folder(folder), json.loads((folder / "manifest.json").read_text())
     assert models.tasks == ("move_to_aim", "pick_place", "pull", "push", "reach_object")
     assert story["data"]["episodes"] == 10 and story["data"]["policy_episodes"] == 0
+    reader = load_object_reader(folder / READER, models.spec)
+    assert models.spec.measured and reader.views == 2 and story["training"]["object_reader"]["error_m"] > 0
     for split in ("heldout", "heldout_ood_object", "heldout_ood_combo"):
         assert {task: values["episodes"] for task, values in story[split].items()} == dict.fromkeys(models.tasks, 1)
         assert "done_push_auc" in story[split]["push"] and "done_pull_auc" not in story[split]["push"]

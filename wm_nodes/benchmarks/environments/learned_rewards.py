@@ -51,7 +51,9 @@ class EmbeddingHead(nn.Module):
         self.num_heads, self.num_tasks = like.num_heads, like.num_tasks
         self.register_buffer("weights", torch.from_numpy(weights).float())
 
-    def forward(self, tokens_BTSD: Tensor, register_BTD: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, tokens_BTSD: Tensor, register_BTD: Tensor, state_BTN: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """The logit of the value (B, T, K, J), inside (0, 1), and no positions."""
         pooled = pooled_features(tokens_BTSD, register_BTD).float()
         weights = self.get_buffer("weights")

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wm_nodes.config.object_state import with_reader
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import file_sha256
 from wm_nodes.core.model_folder import files_sha256
@@ -59,6 +60,9 @@ class Workplace:
     """The task's world model."""
     folder: Path
     """Of its starts and of the policy that training begins with; made there once."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "config", with_reader(self.config, self.model_dir))
 
     @cached_property
     def start(self) -> tuple[Path, Path]:

@@ -131,7 +131,7 @@ def imagine_all(models: WorldModels, real: EpisodeArrays, task: str) -> Imagined
     column, seen, parts = models.task_index(task), list[Tensor](), list[ImaginedEpisodes]()
 
     def keep(module: nn.Module, inputs: tuple[Tensor, Tensor], _: object) -> None:
-        tokens, register = inputs
+        tokens, register = inputs[:2]
         seen.append(pooled_features(tokens, register).float()[:, 0])
 
     features = list[FloatArray]()

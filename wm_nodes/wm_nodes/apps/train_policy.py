@@ -21,6 +21,7 @@ from wm_nodes.apps.policy_pictures import write_pictures
 from wm_nodes.apps.policy_run import RunContext, is_trained, measured_rate, start_graph, success_rate
 from wm_nodes.config.environments import NO_ENVIRONMENT
 from wm_nodes.config.load import ConfigError, dump_config, load_config, with_judge
+from wm_nodes.config.object_state import with_reader
 from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT
 from wm_nodes.config.shipped import shipped_model
@@ -113,6 +114,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
     stage = Stages()
     stage(f"run folder {run_dir}")
     model_dir = _model(arguments, config, run_dir, stage)
+    config = with_reader(config, model_dir)
     starts, weak = start_files(run_dir)
     job = RunContext(
         config, run_dir, starts, stage, arguments.domain_id, arguments.compose, arguments.verbose, arguments.reward,
@@ -200,7 +202,8 @@ def _check(arguments: argparse.Namespace, config: RunConfig) -> None:
         _check_without_task(arguments, config)
     elif not arguments.from_scratch:
         model_dir = Path(arguments.model_dir or shipped_model(config.task))
-        check_model(configured_spec(config), model_dir, model_spec(model_dir, read_world_manifest(model_dir)))
+        spec = configured_spec(with_reader(config, model_dir))
+        check_model(spec, model_dir, model_spec(model_dir, read_world_manifest(model_dir)))
     for bag in config.sft.bags:
         read_spec(Path(bag))
     if config.model_refresh.num_rounds > 1 and not is_simulated(config):

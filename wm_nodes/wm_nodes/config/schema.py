@@ -24,6 +24,8 @@ from wm_nodes.config.tasks import check_task, instruction
 
 AGENT = "agent"
 """Name of the reward agent among the rewards of both loops."""
+TRUTH = "truth"
+"""Of simulation.object_state: as the simulator knows it."""
 EXECUTION = "execution"
 """Name of the reward of clips by an action world model, see video_rl/execution_reward.py."""
 
@@ -34,7 +36,7 @@ TaskName = Annotated[
 the spec of the environment, of its recordings or of the model that was trained on them."""
 ScenesName = Annotated[str, AfterValidator(check_scenes)]
 """Name of a split or of a scene, see config/scenes.py."""
-PolicyInputs = Literal["latents", "positions", "both"]
+PolicyInputs = Literal["latents", "positions", "both", "state"]
 """What a policy sees of a picture, see PolicyConfig.inputs."""
 DeviceName = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 """Where models compute: cpu, cuda, cuda:N, or auto (a GPU where there is one), see core/device.py."""
@@ -62,6 +64,10 @@ class SimulationConfig(SettingsSection):
     """An episode is truncated after this many steps."""
     render_device: str
     """SAPIEN render device; `auto` takes a GPU when there is one, else the software device."""
+    object_state: str = ""
+    """Where the state says, beside the commanded tool, where the things are that the task names: truth: as the
+    simulator knows it; a file: as that reader (environments/object_reader.py) sees it in the picture. Empty: it does
+    not say it, or, in a world model's folder with a reader, as that reader sees it."""
 
 
 class DataConfig(SettingsSection):
@@ -171,6 +177,9 @@ class WorldModelConfig(SettingsSection):
     no positions at all, also not in the losses of decoded_weight."""
     decoded_weight: NonNegativeFloat
     """Weight of the losses on predicted frames after decoding, and after encoding them again (0: off)."""
+    object_reader_iterations: NonNegativeInt = 0
+    """Gradient steps of a reader of where things are, which makes that part of the state (simulation.object_state). 0:
+    none. Of models that collect their own episodes, in tasks with SimulatorPart.object_state."""
 
 
 class ImaginedEnvironmentConfig(SettingsSection):
@@ -228,12 +237,16 @@ class PolicyConfig(SettingsSection):
     """Initial log standard deviation of the Gaussian, normalised action units."""
     inputs: PolicyInputs
     """What the policy sees of a picture, beside the state: the tokenizer's latents, projected; the positions that its
-    probe reads off them, as they are, which are privileged where it learned them from a simulator; or both."""
+    probe reads off them, as they are, which are privileged where it learned them from a simulator; or both. state: the
+    state alone, nothing of the picture."""
     dropout: Annotated[float, Field(ge=0, lt=1)]
     """Share of the projected latents that cloning hides from the actor in each gradient step."""
     two_valued_actions: tuple[str, ...] = ()
     """Names of actions that are executed as -1 or 1, by their sign, e.g. [gripper]: else a clone that is unsure between
     open and closed commands a half-open gripper."""
+    ignored_state: tuple[str, ...] = ()
+    """Names of state values that the policy does not see, where the state has them: from few demonstrations it would
+    learn to follow what does not matter."""
     position_center_m: tuple[float, float, float] = (0.6, 0.0, 0.15)
     """Commanded positions (x, y, z) are shifted by it before the networks see them."""
     position_scale_m: PositiveFloat = 0.2

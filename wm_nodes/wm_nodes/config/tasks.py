@@ -82,6 +82,8 @@ class SimulatorPart:
     (P,), state (S,)) -> action (A,) of one scripted episode. Raises ValueError for an unknown behaviour."""
     actions: Literal["translation", "pose"] = "translation"
     """What an action is, see core/action_spaces.py: translation, A = S = 3, or pose, 7 with rotation and gripper."""
+    object_state: tuple[str, ...] = ()
+    """Ground-truth names of lengths along x, y or z that a state may hold, see simulation.object_state."""
     instruct: Callable[[Scene], str] | None = None
     """The instruction in one scene; None: the task has a scene of its own, and simulation.scenes is empty."""
 

@@ -16,6 +16,8 @@ TASK_PREFIX = "task_"
 TARGET = "target"
 """In the name of a state value that is commanded: computed from the value before, the action and the box. What is named
 otherwise is measured: nobody knows it before it is there, and a model has to predict how it changes."""
+AXES = ("_x", "_y", "_z")
+"""Ends of the names of lengths along an axis."""
 POLICY_FIELDS = (
     "height", "width", "channels", "encoding", "cameras", "action_names", "action_units", "action_scale", "state_names",
     "state_units", "control_period_s",
@@ -91,6 +93,19 @@ class EnvironmentSpec:
     def measured(self) -> tuple[int, ...]:
         """Which values of a state are measured, see TARGET; the others are commanded, or say which task it is."""
         return tuple(i for i, name in enumerate(self.state_names[: self.tool_dim]) if TARGET not in name)
+
+    @cached_property
+    def differences(self) -> tuple[tuple[int, int], ...]:
+        """Pairs of the tool's state values that are lengths along one axis: the one less the other says how far apart
+        two things are."""
+        axes = [(i, name[-2:]) for i, name in enumerate(self.state_names[: self.tool_dim]) if name[-2:] in AXES
+                and self.state_units[i] == "m"]
+        return tuple((i, j) for i, axis in axes for j, other in axes if i < j and axis == other)
+
+    @property
+    def commanded_dim(self) -> int:
+        """How many values of a state are commanded; in the simulator they come first."""
+        return self.tool_dim - len(self.measured)
 
     @property
     def ground_truth_dim(self) -> int:

@@ -210,6 +210,8 @@ def _environment(arguments: Mapping[str, str], backend: str, *, count: str = "nu
         if not arguments[folder]:
             raise GraphError(f"backend:={backend} needs {folder}:=<folder of a trained one>")
         parameters |= {folder: arguments[folder], "starts_file": arguments["starts_file"]}
+    elif folder := arguments.get("model_dir", ""):
+        parameters["model_dir"] = folder  # its object reader, where it has one
     return _node(arguments, "environment", parameters, below=below)
 
 

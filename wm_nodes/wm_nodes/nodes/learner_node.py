@@ -18,6 +18,7 @@ from wm_msgs.action import Rollout as RolloutAction
 from wm_msgs.msg import EnvSpec, ErrorCode, RewardBatch, TransitionBatch
 from wm_msgs.srv import GetWeights, SaveCheckpoint
 from wm_nodes.config.load import load_config
+from wm_nodes.config.object_state import with_reader
 from wm_nodes.config.schema import AGENT
 from wm_nodes.core.errors import WireError, first_few
 from wm_nodes.core.lockstep import DroppedTransitions
@@ -353,7 +354,7 @@ class LearnerNode(TrainingNode):
 
 def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> PolicyTraining:
     """The run that a node's parameters describe."""
-    config = load_config(str(values["config_file"]))
+    config = with_reader(load_config(str(values["config_file"])), Path(str(values["model_dir"])))
     config = config.with_values(device=str(own_device(config.device)))
     policy = make_policy(config, str(values["model_dir"]))
     load_initial(policy, str(values["initial_policy"]))

@@ -67,6 +67,8 @@ def make_encoder(model_dir: Path, device: str = CPU, inputs: PolicyInputs = "lat
         ValueError: positions alone of a model that reads none.
     """
     models = models_of(Path(model_dir), device)
+    if inputs == "state":
+        return ImageEncoder(lambda images: images.new_zeros((len(images), 0)), 0, models.tokenizer_sha256, inputs)
     tokenizer, count = models.tokenizer, 0 if inputs == "latents" else models.tokenizer.num_positions
     if inputs == "positions" and not count:
         raise ValueError(f"policy.inputs is positions, and the model in {model_dir} reads none; take latents")
@@ -116,13 +118,16 @@ def make_policy(config: RunConfig, model_dir: Path | None) -> ImagePolicy:
     state_range = commanded_range(spec, config.policy)
     if spec.measured:
         recorded = models_of(Path(model_dir), config.device).action.condition
-        state_range = recorded.state_mean.tolist(), recorded.state_scale.tolist()
+        codes = spec.state_dim - spec.tool_dim
+        state_range = recorded.state_mean.tolist() + [0.0] * codes, recorded.state_scale.tolist() + [1.0] * codes
     if unknown := set(config.policy.two_valued_actions) - set(spec.action_names):
         raise ValueError(f"policy.two_valued_actions names {', '.join(sorted(unknown))}; the actions are "
                          f"{', '.join(spec.action_names)}")
     policy = ImagePolicy(
         encoder, spec.state_dim, spec.action_dim, config.policy, seed=config.seed, state_range=state_range,
         two_valued=[spec.action_names.index(name) for name in config.policy.two_valued_actions],
+        differences=spec.differences,
+        ignored=[i for i, name in enumerate(spec.state_names) if name in config.policy.ignored_state],
     )
     return policy.to(compute_device(config.device))
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from wm_nodes.config.schema import PolicyConfig, PolicyInputs
+from wm_nodes.core.differences import Differences
 from wm_nodes.core.seeding import stream_seed
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import FloatArray, UInt8Array
@@ -84,6 +85,8 @@ class ImagePolicy(nn.Module):
         seed: of the initial weights (stream `policy_init`).
         state_range: shift and scale of each value of the state (S,); None: it is taken as it is.
         two_valued: which of the actions are -1 or 1.
+        differences: EnvironmentSpec.differences, seen beside the state; none: no differences.
+        ignored: which values of the state are not seen.
     """
 
     actor: nn.Module
@@ -92,15 +95,22 @@ class ImagePolicy(nn.Module):
     def __init__(
         self, encoder: ImageEncoder, state_dim: int, action_dim: int, config: PolicyConfig, *, seed: int = 0,
         state_range: tuple[Sequence[float], Sequence[float]] | None = None, two_valued: Sequence[int] = (),
+        differences: Sequence[tuple[int, int]] = (), ignored: Sequence[int] = (),
     ) -> None:
         super().__init__()
         self.encoder = encoder
         self.state_dim, self.action_dim, self.config, self.two_valued = state_dim, action_dim, config, two_valued
+        self.differences = tuple(pair for pair in differences if not {*pair} & {*ignored})
+        self.ignored, seen = ignored, Differences(state_dim, self.differences)
         center, scale = state_range or ((0.0,) * state_dim, (1.0,) * state_dim)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(stream_seed(seed, "policy_init"))
-            self.actor = _Network(encoder, state_dim, action_dim, config, output_gain=0.01)
-            self.critic = _Network(encoder, state_dim, 1, config, output_gain=1.0)
+            self.actor = _Network(encoder, seen.dim, action_dim, config, output_gain=0.01)
+            self.critic = _Network(encoder, seen.dim, 1, config, output_gain=1.0)
+        self.seen = seen
+        self.shown_S: Tensor | None
+        shown = torch.tensor([value not in ignored for value in range(state_dim)])
+        self.register_buffer("shown_S", shown if ignored else None, persistent=False)
         self.log_std_A = nn.Parameter(torch.full((action_dim,), config.init_log_std))
         self.two_valued_A: Tensor | None
         flags = torch.tensor([action in two_valued for action in range(action_dim)])
@@ -116,7 +126,10 @@ class ImagePolicy(nn.Module):
 
     def clone(self) -> "ImagePolicy":
         """Return a copy with its own weights and the same encoder, without gradients: a reference policy."""
-        copy = ImagePolicy(self.encoder, self.state_dim, self.action_dim, self.config, two_valued=self.two_valued)
+        copy = ImagePolicy(
+            self.encoder, self.state_dim, self.action_dim, self.config, two_valued=self.two_valued,
+            differences=self.differences, ignored=self.ignored,
+        )
         copy.to(self.device)
         copy.load_state_dict(self.state_dict())
         return copy.requires_grad_(False)
@@ -142,6 +155,8 @@ class ImagePolicy(nn.Module):
         """
         if features_BF.ndim != 2 or len(features_BF) < 2:
             raise ValueError(f"normalisation needs features of at least 2 frames, got {tuple(features_BF.shape)}")
+        if not features_BF.shape[1]:
+            return
         std_F = features_BF.std(0, correction=0)
         floor = max(float(std_F.mean()) * _RELATIVE_STD_FLOOR, 1e-6)
         self._buffer("feature_shift_F").copy_(features_BF.mean(0))
@@ -200,7 +215,9 @@ class ImagePolicy(nn.Module):
     def _normalise(self, features_BF: Tensor, states_BS: Tensor) -> tuple[Tensor, Tensor]:
         scaled_BF = (features_BF - self._buffer("feature_shift_F")) / self._buffer("feature_scale_F")
         scaled_BS = (states_BS - self._buffer("state_shift_S")) / self._buffer("state_scale_S")
-        return scaled_BF.clamp(-_FEATURE_LIMIT, _FEATURE_LIMIT), scaled_BS
+        if self.shown_S is not None:
+            scaled_BS = scaled_BS * self.shown_S
+        return scaled_BF.clamp(-_FEATURE_LIMIT, _FEATURE_LIMIT), self.seen(scaled_BS, states_BS)
 
     def _buffer(self, name: str) -> Tensor:
         return cast(Tensor, getattr(self, name))

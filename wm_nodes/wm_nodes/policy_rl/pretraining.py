@@ -16,6 +16,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from wm_nodes.config.load import ConfigError
+from wm_nodes.config.object_state import READER, with_truth
 from wm_nodes.config.scenes import splits
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT, MODEL_EPISODES, WEAK_POLICIES, seed_spans
@@ -35,10 +36,12 @@ from wm_nodes.policy_rl.initial_policy import (
     train_weak_policy,
     write_starts,
 )
+from wm_nodes.policy_rl.object_reader import train_object_reader
 from wm_nodes.recording import read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.recording.training_data import TrainingData, read_training_data
 from wm_nodes.reports.summary import plain
+from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model import ActionModel, Tokenizer, WorldModels, load_model_folder, save_model_folder
 from wm_nodes.world_model.folder import action_model_class
 from wm_nodes.world_model.position_probe import PositionProbe
@@ -46,7 +49,13 @@ from wm_nodes.world_model.sentence_encoder import SentenceEncoder
 from wm_nodes.world_model.text import MAX_WORDS, task_instruction
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.training.decoder import train_decoder
-from wm_nodes.world_model.training.dynamics import LatentEpisodes, tokenise_episodes, train_action_model
+from wm_nodes.world_model.training.dynamics import (
+    LatentEpisodes,
+    fit_states,
+    state_sizes,
+    tokenise_episodes,
+    train_action_model,
+)
 from wm_nodes.world_model.training.position_probe import train_position_probe
 from wm_nodes.world_model.training.state_probe import train_state_probe
 from wm_nodes.world_model.training.text import demonstrators, golden_rows, train_text_model
@@ -56,6 +65,8 @@ from wm_nodes.world_model.validation.acceptance import model_metrics
 from wm_nodes.world_model.validation.controllability import controllability_metrics
 from wm_nodes.world_model.validation.goals import goal_metrics
 
+OWN = "two_valued_actions", "ignored_state"
+"""Settings of a weak policy that are those of its task."""
 FEW_STEPS = 16
 """Of one iteration of the action model: where recorded episodes are longer, their user hears of parts."""
 
@@ -79,7 +90,7 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
     if not config.data.ground_truth:
         raise ConfigError("data.ground_truth is false, and a world model that collects its own episodes learns from "
                           "it; collect with wm collect and train with wm train-model")
-    folder = run_dir / "model"
+    folder, config = run_dir / "model", with_truth(config)
     if (folder / MANIFEST).exists():
         return folder
     device = compute_device(config.device)
@@ -96,8 +107,12 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
         seen = EpisodeArrays.concatenate([seen, load_arrays(chain(*scattered.values()), config)])
     with explain_memory(device, tokenizer__batch_size=config.tokenizer.batch_size):
         tokenizer, tokenizer_metrics = train_tokenizer(seen, config, config.seed, run_dir)
+    eyes, reader_metrics = None, dict[str, float]()
+    if config.world_model.object_reader_iterations:
+        eyes, reader_metrics = train_object_reader(seen, spec, config, run_dir)
     if config.data.policy_episodes:
-        policy_bags = _collect_policy_bags(config, run_dir, tokenizer, spec)
+        states = torch.from_numpy(seen.states).flatten(0, 1)
+        policy_bags = _collect_policy_bags(config, run_dir, tokenizer, spec, states)
         seen = EpisodeArrays.concatenate([seen, load_arrays(policy_bags, config)])
     probe, probe_metrics = train_position_probe(seen, config, config.seed, run_dir)
     episodes, data = seen, tokenise_episodes(tokenizer, seen)
@@ -128,6 +143,7 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
         "success_threshold": config.reward.success_threshold,
         "training": {
             "tokenizer": tokenizer_metrics, **dynamics_metrics, "text": text_metrics, "probe": probe_metrics,
+            **({"object_reader": reader_metrics} if eyes else {}),
         },
     }
     tasks = model_tasks(config.task)
@@ -141,6 +157,8 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
         chain(*bags.values()), folder / STARTS, MODEL_STARTS if len(bags) == 1 else MODEL_STARTS // 2, tasks=tasks,
         frames=config.data.start_frames, seed=config.seed,
     )
+    if eyes:  # before the manifest, which says that the folder is complete
+        save_weights(eyes, folder / READER)
     decoder = shown_by.decoder if config.tokenizer.decoder_iterations else None
     save_model_folder(
         folder, tokenizer, action, text, config, spec=spec, tasks=tasks, story=story, probe=probe, decoder=decoder
@@ -250,9 +268,9 @@ def _train_dynamics(
     """Train the action model that goes with the tokenizer, and where asked for a decoder of its rollouts; returns it,
     the tokenizer that shows what it imagines, and the metrics of both."""
     if config.tokenizer.kind == "lfq":
-        tokens, found = train_token_model(tokenizer, data, config, config.seed, run_dir, measured=spec.measured)
+        tokens, found = train_token_model(tokenizer, data, config, config.seed, run_dir, spec=spec)
         return tokens, tokenizer, {"decoder": {}, "action": found}
-    action, found = train_action_model(tokenizer, data, config, config.seed, run_dir, measured=spec.measured)
+    action, found = train_action_model(tokenizer, data, config, config.seed, run_dir, spec=spec)
     shown_by, decoder_metrics = tokenizer, dict[str, float]()
     if config.tokenizer.decoder_iterations:
         shown_by, decoder_metrics = train_decoder(tokenizer, action, data, config, config.seed, run_dir)
@@ -289,18 +307,20 @@ def _heldout_sets(config: RunConfig) -> dict[str, tuple[RunConfig, str]]:
 
 
 def _collect_policy_bags(
-    config: RunConfig, run_dir: Path, tokenizer: Tokenizer, spec: EnvironmentSpec
+    config: RunConfig, run_dir: Path, tokenizer: Tokenizer, spec: EnvironmentSpec, states_FP: Tensor
 ) -> list[Path]:
     """Collect simulator episodes of a few policies cloned from a few demonstrations, acting with exploration noise.
 
-    They need the tokenizer only, so they are collected before the action model is trained and belong to its data.
+    They need the tokenizer and the range of the states (F, P) only, so they are collected before the action model is
+    trained and belong to its data.
     """
     bags = list[Path]()
     weak = [(policy, task) for task in model_tasks(config.task) for policy in get_task(task).model.weak_policies]
     for policy, task in sorted(weak, key=lambda pair: pair[0].number):
         number, sft = policy.number, config.sft.model_copy(update={"num_demonstrations": policy.demonstrations})
-        chosen = config.model_copy(update={"task": task, "sft": sft})
-        folder = _make_tokenizer_folder(config, run_dir, tokenizer, spec)
+        own = {name: tuple(get_task(task).settings.get(f"policy.{name}", ())) for name in OWN}
+        chosen = config.with_values(task=task, sft=sft, policy=config.policy.with_values(**own))
+        folder = _make_tokenizer_folder(config, run_dir, tokenizer, spec, states_FP)
         weights = run_dir / "policies" / f"weak_{number}.safetensors"
         if not weights.exists():
             plan = demonstration_plan(chosen, *policy.plan)
@@ -314,8 +334,11 @@ def _collect_policy_bags(
     return bags
 
 
-def _make_tokenizer_folder(config: RunConfig, run_dir: Path, tokenizer: Tokenizer, spec: EnvironmentSpec) -> Path:
-    """Make a model folder for policies, which read the tokenizer alone: its action model is untrained."""
+def _make_tokenizer_folder(
+    config: RunConfig, run_dir: Path, tokenizer: Tokenizer, spec: EnvironmentSpec, states_FP: Tensor
+) -> Path:
+    """Make a model folder for policies, which read the tokenizer and the range of the states alone: its action model is
+    untrained."""
     folder = run_dir / "tokenizer_only"
     if not (folder / MANIFEST).exists():
         tasks = model_tasks(config.task)
@@ -323,7 +346,8 @@ def _make_tokenizer_folder(config: RunConfig, run_dir: Path, tokenizer: Tokenize
             untrained = action_model_class(config.tokenizer.kind)(
                 config.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
                 action_dim=spec.action_dim, state_dim=spec.tool_dim, num_tasks=len(tasks),
-                num_positions=tokenizer.num_positions, measured=spec.measured,
+                num_positions=tokenizer.num_positions, **state_sizes(spec),
             )
+        fit_states(untrained.condition, states_FP)
         save_model_folder(folder, tokenizer, untrained, None, config, spec=spec, tasks=tasks, story={})
     return folder

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from wm_nodes.config.load import load_config, split_settings
+from wm_nodes.config.object_state import with_reader
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.types import Environment, Rollout
 from wm_nodes.policy_rl import factories
@@ -43,9 +44,8 @@ def main(words: list[str] | None = None) -> None:
     try:
         options, settings = split_settings(sys.argv[1:] if words is None else words)
         given = vars(parser.parse_args(options))
-        folder = given.pop("model_dir")
-        config = load_config(given.pop("preset"), given | settings)
-        model = factories.chosen_model(config, folder)
+        folder, config = given.pop("model_dir"), load_config(given.pop("preset"), given | settings)
+        config = with_reader(config, model := factories.chosen_model(config, folder))
         policy, reward = factories.make_policy(config, model), factories.make_reward(config, model, golden=True)
         env = factories.make_training_environment(config, model, num_envs=config.ppo.num_envs, seed=config.seed)
     except (ValueError, OSError) as error:

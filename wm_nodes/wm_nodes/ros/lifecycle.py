@@ -17,6 +17,7 @@ from rclpy.service_introspection import ServiceIntrospectionState
 
 from wm_msgs.msg import ErrorCode, RunState
 from wm_nodes.config.load import ConfigError, load_config
+from wm_nodes.config.object_state import with_reader
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.errors import WireError
 from wm_nodes.ros import convert, diagnostics
@@ -134,7 +135,8 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             raise ValueError(f"{self.get_name()}: parameter config_file is empty; give the resolved YAML configuration")
         if not Path(path).exists():
             raise ValueError(f"{self.get_name()}: config_file {path!r} does not exist")
-        return load_config(path)
+        folder = str(self.param("model_dir")) if "model_dir" in self._params else ""
+        return with_reader(load_config(path), Path(folder) if folder else None)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """What rclpy calls for `ros2 param set`. A refused change names value and remedy, and is counted."""

@@ -139,7 +139,7 @@ def load_model_folder(
     sizes = {"num_tokens": tokenizer.num_tokens, "latent_dim": tokenizer.latent_dim, "num_positions": num_positions}
     action = action_model_class(tokenizer_config.kind)(
         config, action_dim=spec.action_dim, state_dim=spec.state_dim, num_tasks=num_tasks, measured=spec.measured,
-        **sizes
+        differences=spec.differences, **sizes
     )
     _load(folder, "tokenizer", tokenizer, manifest)
     if rollout_decoder and "decoder" in manifest["sha256"]:

@@ -8,6 +8,7 @@ therefore always seen complete, whatever is masked, and nothing of frame t + 1 h
 The commit pass, with the whole of frame t + 1 decided, writes the cache and gives the done signal of frame t + 1.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -36,6 +37,7 @@ class TokenActionModel(nn.Module):
     def __init__(
         self, config: WorldModelConfig, *, num_tokens: int, latent_dim: int, action_dim: int, state_dim: int,
         num_tasks: int, num_positions: int = 0, measured: tuple[int, ...] = (),
+        differences: Sequence[tuple[int, int]] = (),
     ) -> None:
         super().__init__()
         width = config.width
@@ -50,7 +52,9 @@ class TokenActionModel(nn.Module):
         self.copy_bias = nn.Parameter(torch.full((len(self.heads),), 2.0))
         self.done = DoneHeads(width, config.num_done_heads, num_tasks)
         self.condition = ActionCondition(action_dim, state_dim, width)
-        self.state_change = StateChange(action_dim, state_dim, latent_dim, measured) if measured else None
+        self.state_change = (
+            StateChange(action_dim, state_dim, latent_dim, measured, differences) if measured else None
+        )
 
     def forward(
         self, bits_BTSD: Tensor, next_bits_BTSD: Tensor, decided_BTS: Tensor, condition_BTND: Tensor,

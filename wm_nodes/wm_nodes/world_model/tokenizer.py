@@ -135,8 +135,10 @@ class Tokenizer(nn.Module):
         return values.float()
 
     def flatten(self, latents_BSD: Tensor, inputs: PolicyInputs) -> Tensor:
-        """A policy's features of latents: they themselves (B, S D), the normalised positions (B, P), or one after the
-        other."""
+        """A policy's features of latents: they themselves (B, S D), the normalised positions (B, P), one after the
+        other, or nothing (B, 0)."""
+        if inputs == "state":
+            return latents_BSD.flatten(1)[:, :0]
         if inputs == "latents":
             return latents_BSD.flatten(1)
         positions = self.read_state_normalised(latents_BSD)

@@ -3,21 +3,26 @@
 Shapes: N environments, A action, S state, P ground truth.
 """
 
+from pathlib import Path
+
 import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
 
 from wm_nodes.config.scenes import Scene, scene_of
-from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.schema import TRUTH, SimulationConfig
 from wm_nodes.config.seed_ranges import UNSEEDED
 from wm_nodes.config.tasks import get_task, part_of, simulator_part, success
 from wm_nodes.core.cameras import CameraModel, Matrix
 from wm_nodes.core.seeding import stream_seed
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+from wm_nodes.environments.maniskill.behaviours import ROBOT_BASE
 from wm_nodes.environments.maniskill.cameras import table_top_cameras
 from wm_nodes.environments.maniskill.control import CONTROLS
+from wm_nodes.environments.maniskill.objects import STARTS
 from wm_nodes.environments.maniskill.scenes import make_scene, render, renew_physics
 from wm_nodes.environments.maniskill.spec import simulation_spec
+from wm_nodes.environments.object_reader import load_object_reader
 
 
 class ManiSkillEnvironment:
@@ -25,7 +30,8 @@ class ManiSkillEnvironment:
     follows from its seed and its actions, bit for bit: not from the episodes before it, nor from num_envs.
 
     end_on_success=False lets an episode go on to the step limit: a done head needs frames after success.
-    pictures=False leaves them black: a step is then physics alone, in a third of the time.
+    pictures=False leaves them black, and what would be read off them NaN: a step is then physics alone, in a third of
+    the time.
     new_physics=False leaves the physics its traces of earlier episodes; contacts then depend on them.
     """
 
@@ -42,6 +48,8 @@ class ManiSkillEnvironment:
         self._end_on_success = end_on_success
         self._pictures = pictures
         self._new_physics = new_physics
+        read = config.object_state not in ("", TRUTH)
+        self._reader = load_object_reader(Path(config.object_state), self.spec) if read else None
         self._control = CONTROLS[self._task.actions]
         modes = {"control_mode": self._control.control_mode, "obs_mode": self._control.obs_mode}
         self._scenes = [make_scene(self._task.scene, config, **modes) for _ in range(num_envs)]
@@ -110,7 +118,7 @@ class ManiSkillEnvironment:
         terminated, truncated = np.zeros(num_envs, bool), np.zeros(num_envs, bool)
         for i in np.flatnonzero(valid):
             target = next_state(self._states[i], actions[i], self.spec)
-            tool = self._states[i, : self.spec.tool_dim]
+            tool = self._states[i, : self.spec.commanded_dim]
             tool[:] = self._control.step(self._scenes[i], tool, target[: len(tool)])
             self._steps[i] += 1
             self._observe(i)
@@ -133,7 +141,7 @@ class ManiSkillEnvironment:
     def _start(self, i: int) -> None:
         self._first_truth[i] = self._task.measure(self._scenes[i], None)
         code = [part == self._parts[i] for part in self._codes]
-        self._states[i] = [*self._control.state(self._scenes[i]), *code]
+        self._states[i] = [*self._control.state(self._scenes[i]), *(0.0 for _ in self.spec.measured), *code]
         self._observe(i)
 
     def _observe(self, i: int) -> None:
@@ -141,6 +149,26 @@ class ManiSkillEnvironment:
         if self._pictures:
             self._images[i] = render(scene, self._config.cameras)
         self._truth[i] = self._task.measure(scene, self._first_truth[i])
+        if self.spec.measured:
+            self._observe_objects(i)
+
+    def _observe_objects(self, i: int) -> None:
+        """Fill the measured values of the state: what the pictures show of the truth, or what is read off them."""
+        state, names = self._states[i], self.spec.state_names
+        if self._reader and not self._pictures:
+            state[list(self.spec.measured)] = np.nan
+        elif self._reader:
+            read = self._reader.fill(self._images[i : i + 1], self._states[i : i + 1])[0]
+            if not self._steps[i]:
+                for name in STARTS:
+                    read[names.index(name)] = read[names.index(name.replace("start_", ""))]
+            state[:] = read
+        else:
+            shown = get_task(self._parts[i]).model.positions
+            for column in self.spec.measured:
+                name = names[column]
+                place = self._truth[i, self.spec.ground_truth_names.index(name)] - ROBOT_BASE["xyz".index(name[-1])]
+                state[column] = 0.0 if name.startswith("goal_") and name not in shown else place
 
     def current(self) -> Observation:
         """The observation as of the last reset or step."""

@@ -42,7 +42,7 @@ def scripted_episode(env: ManiSkillEnvironment, behaviour: str, seed: int, episo
     def act(observation: Observation, truth_now: FloatArray) -> FloatArray:
         if behaviour == SCATTERED:
             env.scene.scatter(rng)
-        return scripted(truth_now, observation.state[0, : env.spec.tool_dim])
+        return scripted(truth_now, observation.state[0, : env.spec.commanded_dim])
 
     return record_episode(env, act, behaviour, seed, episode_id)
 
@@ -60,7 +60,7 @@ def recovered_episode(env: ManiSkillEnvironment, begin: Act, seed: int, episode_
             return begin(observation, truth)
         if scripted is None:
             scripted = script("expert", truth, rng, env.spec.action_scale[0])
-        return scripted(truth, observation.state[0, : env.spec.tool_dim])
+        return scripted(truth, observation.state[0, : env.spec.commanded_dim])
 
     episode = record_episode(env, act, RECOVERY, seed, episode_id)
     return replace(episode, extra={**episode.extra, TAKEN_OVER: first})
@@ -120,7 +120,7 @@ def planned_episode(
         path_follower = follow(planner.tool_path(), env.spec.action_scale[0])
 
     def act(observation: Observation, truth: FloatArray) -> FloatArray:
-        return path_follower(observation.state[0, : env.spec.tool_dim])
+        return path_follower(observation.state[0, : env.spec.commanded_dim])
 
     return record_episode(env, act, behaviour, seed, episode_id)
 

@@ -21,6 +21,10 @@ grasped: 1 where both fingers press on the object."""
 POSITIONS = {name: name for name in ("object_x", "object_y", "tool_x", "tool_y", "tool_z")}
 """What probes learn where the pictures do not show the goal, see config/tasks.py: ModelPart."""
 WITH_GOAL = POSITIONS | {name: name for name in ("goal_x", "goal_y")}
+STARTS = ("object_start_x", "object_start_y")
+"""Where the object was at the reset."""
+STATE = ("object_x", "object_y", "object_z", "container_x", "container_y", "goal_x", "goal_y", *STARTS)
+"""What a state may hold of the ground truth: where pictures do not show the goal, 0 instead of it."""
 MIDDLE_M = 0.02
 """About where the middle of an object is above the table."""
 OBJECT, OBJECT_START = CUBE, CUBE_START
@@ -42,6 +46,12 @@ GRASPING = {"policy.two_valued_actions": ["gripper"]}
 """Of tasks with a grasp."""
 ON_TABLE_M = 0.01
 """An object whose lowest point is below this lies on the table."""
+
+
+def policy_sees(*places: str) -> dict[str, list[str]]:
+    """Of a task whose policies need these places, of container and goal, beside the object's."""
+    others = tuple({"container", "goal", "object_start"} - {*places})
+    return {"policy.ignored_state": [name for name in STATE if name.startswith(others)]}
 
 
 def weak_policies(number: int) -> tuple[WeakPolicy, ...]:

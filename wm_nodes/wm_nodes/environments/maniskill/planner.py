@@ -84,7 +84,7 @@ class DemonstrationPlanner:
 
     def start(self) -> FloatArray:
         """The environment's commanded state (7,), with its position in the world frame."""
-        state: FloatArray = self._env.current().state[0, : self._env.spec.tool_dim] + np.pad(ROBOT_BASE, (0, 4))
+        state: FloatArray = self._env.current().state[0, : self._env.spec.commanded_dim] + np.pad(ROBOT_BASE, (0, 4))
         return state
 
     def pose_path(self, waypoints: list[FloatArray]) -> FloatArray:

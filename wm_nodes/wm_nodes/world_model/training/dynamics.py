@@ -9,7 +9,7 @@ phase of its own in each episode, so every recorded frame is used in every itera
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -17,9 +17,11 @@ from torch.nn import functional as F
 
 from wm_nodes.config.schema import RunConfig, WorldModelConfig
 from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
+from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.background import BackgroundBatches
 from wm_nodes.training.loop import TrainingLoop
+from wm_nodes.world_model.conditions import ActionCondition
 from wm_nodes.world_model.dynamics import ActionModel, FrameModel, Prediction
 from wm_nodes.world_model.precision import compute_context, has_fast_bfloat16
 from wm_nodes.world_model.state_change import StateChange
@@ -111,19 +113,20 @@ def tokenise_episodes(tokenizer: Tokenizer, episodes: EpisodeArrays) -> LatentEp
 
 def train_action_model(
     tokenizer: Tokenizer, episodes: EpisodeArrays | LatentEpisodes, config: RunConfig, seed: int, run_dir: Path | None,
-    *, model: ActionModel | None = None, done_loss: str = "bce", measured: tuple[int, ...] = (),
+    *, model: ActionModel | None = None, done_loss: str = "bce", spec: EnvironmentSpec | None = None,
 ) -> tuple[ActionModel, dict[str, float]]:
     """Train WM_act on episodes of any behaviour; returns the model (averaged weights) and its last metrics.
 
     Loss (RS-4): world_model.latent_weight * latents + world_model.done_weight * done + world_model.state_weight *
     positions (those the model says, and those the tokenizer's frozen probe reads off the predicted latents) +
     world_model.decoded_weight * decoded_losses, without recoded_state where state_weight is 0. `model` continues from
-    given weights (online rounds). measured: as new_model's; their loss is state_change_loss, with weight 1.
+    given weights (online rounds). spec: as new_model's; the loss of its measured values is state_change_loss, with
+    weight 1.
     """
     data = episodes if isinstance(episodes, LatentEpisodes) else tokenise_episodes(tokenizer, episodes)
     settings = config.world_model
     if model is None:
-        model = new_model(ActionModel, "action_model_init", tokenizer, data, settings, seed, measured)
+        model = new_model(ActionModel, "action_model_init", tokenizer, data, settings, seed, spec)
     tokenizer.requires_grad_(False)
     trained = model
     heads = bootstrap_masks(len(data), settings.num_done_heads, seed).to(tokenizer.device)
@@ -176,31 +179,41 @@ def train_action_model(
 
 def new_model(
     kind: type[M], stream: str, tokenizer: Tokenizer, data: LatentEpisodes, settings: WorldModelConfig, seed: int,
-    measured: tuple[int, ...] = (),
+    spec: EnvironmentSpec | None = None,
 ) -> M:
     """Return a model with first weights from `stream`, whose condition lets the data's states span [-1, 1].
 
-    measured: EnvironmentSpec.measured, of which the model predicts how they change."""
+    spec: of the environment whose measured values the model predicts; None: there are none."""
     with initial_weights(seed, stream):
         model = kind(
             settings, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
             action_dim=data.actions.shape[-1], state_dim=data.states.shape[-1], num_tasks=data.success.shape[-1],
-            num_positions=data.truth.shape[-1], measured=measured,
+            num_positions=data.truth.shape[-1], **state_sizes(spec),
         )
-    states = data.states.flatten(0, 1)
-    model.condition.state_mean.copy_((states.amax(0) + states.amin(0)) / 2)
-    model.condition.state_scale.copy_(((states.amax(0) - states.amin(0)) / 2).clamp_min(1e-3))
+    fit_states(model.condition, data.states.flatten(0, 1))
     if model.state_change is not None:
         before, after = data.states[:, :-1][data.step_mask], data.states[:, 1:][data.step_mask]
         model.state_change.fit_scale(before, after - before)
     return model.to(tokenizer.device)
 
 
+def fit_states(condition: ActionCondition, states_FP: Tensor) -> None:
+    """Let states (F, P) span [-1, 1]."""
+    condition.state_mean.copy_((states_FP.amax(0) + states_FP.amin(0)) / 2)
+    condition.state_scale.copy_(((states_FP.amax(0) - states_FP.amin(0)) / 2).clamp_min(1e-3))
+
+
+def state_sizes(spec: EnvironmentSpec | None) -> dict[str, Any]:
+    """What a model is told of the state, beside its size."""
+    return {"measured": spec.measured, "differences": spec.differences} if spec else {}
+
+
 def state_change_loss(change: StateChange, part: LatentEpisodes) -> Tensor:
     """Mean Huber loss of the predicted changes of the measured values, from recorded frames and states."""
     states, steps = part.states, part.step_mask.float().unsqueeze(-1)
     found = change(part.latents[:, :-1], part.actions, states[:, :-1])
-    errors = F.huber_loss(found, change.wanted(states[:, :-1], states[:, 1:]), reduction="none")
+    wanted = change.wanted(states[:, :-1], states[:, 1:])
+    errors = F.huber_loss(found, wanted, reduction="none", delta=change.delta) / change.delta
     return (errors * steps).sum() / (steps.sum() * errors.shape[-1]).clamp_min(1)
 
 
@@ -251,17 +264,18 @@ def unroll(
     real = data.latents[index].float()
     states, actions = data.states[index], data.actions[index]
     noisy = tokenizer.normalise(real[:, :-1] + INPUT_NOISE * noise)
-    condition = model.condition(actions, states[:, :-1], states[:, 1:])
+    condition, seen = model.condition(actions, states[:, :-1], states[:, 1:]), model.done_state(states[:, 1:])
     if one_pass:
-        prediction = model.predict(noisy, condition)
+        prediction = model.predict(noisy, condition, state_BTN=seen)
         one_step = tokenizer.normalise(noisy + prediction.change_BTSD)
         return RolloutTerms(one_step, prediction.positions_BTQ, prediction.done_logits_BTKJ)
     if wants_few_kernels(noisy.device):
-        return roll_out_for_device(model, tokenizer, noisy, anchors, condition)
+        return roll_out_for_device(model, tokenizer, noisy, anchors, condition, state=seen)
     caches = model.trunk.new_caches()
 
     def predict(t: int, latents: Tensor) -> Prediction:
-        return model.predict(latents, condition[:, t : t + 1], caches)
+        now = None if seen is None else seen[:, t : t + 1]
+        return model.predict(latents, condition[:, t : t + 1], caches, state_BTN=now)
 
     def choose_input(t: int, frame: Tensor) -> Tensor:
         return torch.where(anchors[:, t, None, None, None], noisy[:, t : t + 1], frame)
@@ -297,11 +311,11 @@ def wants_few_kernels(device: torch.device) -> bool:
 
 def roll_out_for_device(
     model: FrameModel, tokenizer: Tokenizer, real: Tensor, anchors: Tensor, condition: Tensor,
-    visible: Tensor | None = None,
+    visible: Tensor | None = None, state: Tensor | None = None,
 ) -> RolloutTerms:
     """roll_out in few kernels: the same numbers to rounding. See device_rollout for the arguments."""
     dtype = torch.bfloat16 if has_fast_bfloat16(real.device) else torch.float32
-    return RolloutTerms(*roll_out_on_device(model, tokenizer, real, anchors, condition, dtype, visible))
+    return RolloutTerms(*roll_out_on_device(model, tokenizer, real, anchors, condition, dtype, visible, state))
 
 
 def rollout_losses(

@@ -53,7 +53,8 @@ def train_text_model(
             num_positions=tokenizer.num_positions,
         )
     model.condition(row_instructions(episodes, rows, instructions))  # raises before a long training, not in it
-    shared = {name: t for name, t in action_model.state_dict().items() if not name.startswith("condition.")}
+    own = ("condition.", "done.heads.") if action_model.seen else ("condition.",)  # heads that see a state differ
+    shared = {name: t for name, t in action_model.state_dict().items() if not name.startswith(own)}
     model.load_state_dict(shared, strict=False)
     model.to(tokenizer.device)
     tokenizer.requires_grad_(False)

@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.seeding import numpy_stream, torch_stream
+from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.decoding import choose_codes, code_targets
 from wm_nodes.world_model.precision import compute_context
@@ -31,11 +32,11 @@ the model meets errors of its own kind."""
 
 def train_token_model(
     tokenizer: Tokenizer, data: LatentEpisodes, config: RunConfig, seed: int, run_dir: Path | None,
-    *, measured: tuple[int, ...] = (),
+    *, spec: EnvironmentSpec | None = None,
 ) -> tuple[TokenActionModel, dict[str, float]]:
-    """Train WM_act over tokens (RS-2a, RS-3, RS-4); returns it with its last metrics. measured: as new_model's."""
+    """Train WM_act over tokens (RS-2a, RS-3, RS-4); returns it with its last metrics. spec: as new_model's."""
     settings = config.world_model
-    model = new_model(TokenActionModel, "token_model_init", tokenizer, data, settings, seed, measured)
+    model = new_model(TokenActionModel, "token_model_init", tokenizer, data, settings, seed, spec)
     heads = bootstrap_masks(len(data), settings.num_done_heads, seed).to(tokenizer.device)
 
     def loss(iteration: int) -> dict[str, Tensor]:

@@ -61,7 +61,9 @@ TASK = Task(
         **objects.SETTINGS, **objects.GRASPING, "data.behaviours": MOVING, "sft.num_demonstrations": 1500,
         "sft.num_iterations": 3000,
     },
-    simulator=SimulatorPart(scene, measure, waypoints, script, actions="pose", instruct=instruct),
+    simulator=SimulatorPart(
+        scene, measure, waypoints, script, actions="pose", object_state=objects.STATE, instruct=instruct
+    ),
     model=ModelPart(tasks=PARTS, positions=objects.POSITIONS),
     judge=JudgePart(object_height_m=objects.MIDDLE_M),
 )

@@ -44,9 +44,10 @@ TASK = Task(
     instruction="move the object onto the carpet",
     ground_truth_names=objects.GROUND_TRUTH_NAMES,
     success=success,
-    settings={**objects.SETTINGS, **objects.GRASPING, "data.behaviours": CARRYING},
+    settings={**objects.SETTINGS, **objects.GRASPING, **objects.policy_sees("goal"), "data.behaviours": CARRYING},
     simulator=SimulatorPart(
-        scene, objects.measure, carry_waypoints, scripted(carry_waypoints, speed=0.8), actions="pose", instruct=instruct
+        scene, objects.measure, carry_waypoints, scripted(carry_waypoints, speed=0.8), actions="pose",
+        object_state=objects.STATE, instruct=instruct,
     ),
     model=ModelPart(
         tasks=objects.MODEL_TASKS, positions=objects.WITH_GOAL, weak_policies=objects.weak_policies(0)

@@ -47,9 +47,10 @@ TASK = Task(
     instruction="pick up the object and place it in the container",
     ground_truth_names=objects.GROUND_TRUTH_NAMES,
     success=success,
-    settings={**objects.SETTINGS, **objects.GRASPING, "data.behaviours": CARRYING},
+    settings={**objects.SETTINGS, **objects.GRASPING, **objects.policy_sees("container"), "data.behaviours": CARRYING},
     simulator=SimulatorPart(
-        scene, objects.measure, place_waypoints, scripted(place_waypoints, speed=0.8), actions="pose", instruct=instruct
+        scene, objects.measure, place_waypoints, scripted(place_waypoints, speed=0.8), actions="pose",
+        object_state=objects.STATE, instruct=instruct,
     ),
     model=ModelPart(
         tasks=objects.MODEL_TASKS, positions=objects.WITH_GOAL, weak_policies=objects.weak_policies(1)

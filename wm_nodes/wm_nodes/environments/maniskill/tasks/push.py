@@ -53,15 +53,16 @@ def instruct(scene: Scene) -> str:
 
 
 SIMULATOR = SimulatorPart(
-    scene, objects.measure, waypoints, scripted(waypoints, speed=0.5), actions="pose", instruct=instruct
+    scene, objects.measure, waypoints, scripted(waypoints, speed=0.5), actions="pose", instruct=instruct,
+    object_state=objects.STATE,
 )
 TASK = Task(
     instruction="push the object away from the robot",
     ground_truth_names=objects.GROUND_TRUTH_NAMES,
     success=success,
     settings={
-        **objects.SETTINGS, "data.behaviours": MOVING, "policy.init_log_std": -2.0, "ppo.target_kl": 0.2,
-        "ppo.kl_reference_weight": 0.01,
+        **objects.SETTINGS, **objects.policy_sees(), "data.behaviours": MOVING, "policy.init_log_std": -2.0,
+        "ppo.target_kl": 0.2, "ppo.kl_reference_weight": 0.01,
     },
     simulator=SIMULATOR,
     model=ModelPart(

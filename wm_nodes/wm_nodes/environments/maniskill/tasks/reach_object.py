@@ -50,9 +50,10 @@ TASK = Task(
     instruction="move the gripper above the object",
     ground_truth_names=objects.GROUND_TRUTH_NAMES,
     success=success,
-    settings={**objects.SETTINGS, "data.behaviours": MOVING},
+    settings={**objects.SETTINGS, **objects.policy_sees(), "data.behaviours": MOVING},
     simulator=SimulatorPart(
-        scene, objects.measure, waypoints, scripted(waypoints, speed=0.8), actions="pose", instruct=instruct
+        scene, objects.measure, waypoints, scripted(waypoints, speed=0.8), actions="pose", instruct=instruct,
+        object_state=objects.STATE,
     ),
     model=ModelPart(
         tasks=objects.MODEL_TASKS, positions=objects.POSITIONS, moves_object=False,
