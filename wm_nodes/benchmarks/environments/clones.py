@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from benchmarks.environments.experiments import Configured
 from benchmarks.environments.policies import SIMULATOR, Workplace, rate_of, rate_over_seeds
@@ -31,8 +31,8 @@ class Clones(Configured):
     """Of the settings: a name, or a .yaml."""
     tasks: tuple[str, ...] = TASKS
     """Each has demonstrations of its own."""
-    inputs: tuple[PolicyInputs, ...] = get_args(PolicyInputs)
-    """What the policy sees, values of policy.inputs."""
+    inputs: tuple[PolicyInputs, ...] = ("latents", "positions", "both")
+    """What the policy sees, values of policy.inputs; state: of a model with an object reader."""
     demonstrations: tuple[Count, ...] = (10, 25, 100, 400)
     """Numbers of them; a smaller number has the first of the largest."""
     seeds: tuple[int, ...] = (0, 1, 2)
