@@ -127,6 +127,12 @@ def test_a_policy_of_the_state_sees_nothing_of_the_picture(config: RunConfig, tm
     np.testing.assert_array_equal(policy.clone().act(pictures[0], state).actions, first)
 
 
+def test_a_policy_that_would_see_the_commanded_tool_alone_is_refused(config: RunConfig, tmp_path: Path) -> None:
+    plain = config.with_values(simulation=config.simulation.with_values(object_state=""))
+    with pytest.raises(ValueError, match="take a model with an object reader"):
+        make_policy(plain, folder_of(plain, tmp_path))
+
+
 def test_what_does_not_matter_in_a_task_is_not_seen_by_its_policies(config: RunConfig, tmp_path: Path) -> None:
     folder, spec = folder_of(config, tmp_path), configured_spec(config)
     policy, image = make_policy(config, folder), np.zeros((1, spec.height, spec.width, 3), np.uint8)

@@ -101,7 +101,8 @@ def make_policy(config: RunConfig, model_dir: Path | None) -> ImagePolicy:
     measured states are shifted and scaled by what was recorded.
 
     Raises:
-        ValueError: neither a factory nor a checkpoint nor a model; a two-valued action that the spec has not.
+        ValueError: neither a factory nor a checkpoint nor a model; a two-valued action that the spec has not; a state
+            that is all commanded, and nothing else to see.
     """
     if config.policy.factory:
         made: ImagePolicy = load_factory(config.policy.factory)(config)
@@ -115,6 +116,9 @@ def make_policy(config: RunConfig, model_dir: Path | None) -> ImagePolicy:
                          f"{UNTRAINED}")
     encoder = make_encoder(model_dir, config.device, config.policy.inputs)
     spec = run_spec(config, model_dir)
+    if config.policy.inputs == "state" and not spec.measured:
+        raise ValueError("policy.inputs is state, and the state says of nothing but the commanded tool where it is; "
+                         "take a model with an object reader (preset scenes), or latents")
     state_range = commanded_range(spec, config.policy)
     if spec.measured:
         recorded = models_of(Path(model_dir), config.device).action.condition

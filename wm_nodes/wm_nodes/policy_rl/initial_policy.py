@@ -132,7 +132,9 @@ def train_weak_policy(
     if more := [*recoveries]:
         recovered = (e for bag in more for e in read_episodes(bag, expected=spec))
         demos += demonstrations(recovered, config.sft.recoveries, RECOVERY, "sft.recoveries")
-    train_sft(policy, demos, config.sft, config.seed, reconstruct=make_reconstruct(model_dir, config.device))
+    sees = policy.encoder.feature_dim > 0
+    shown = make_reconstruct(model_dir, config.device) if sees else None
+    train_sft(policy, demos, config.sft, config.seed, reconstruct=shown)
     save_weights(policy, path, {"tokenizer_sha256": policy.encoder.sha256})
     return policy
 
