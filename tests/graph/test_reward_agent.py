@@ -281,6 +281,7 @@ def test_a_policys_episodes_are_judged_at_their_end_and_a_judge_that_is_down_pau
             client = probe.action(Train, "train")
             result = probe.finish(probe.send(client, Train.Goal(updates=1)))
             assert (result.termination_reason, result.message) == (Train.Result.FINISHED, "")
+            wait_until("transitions", lambda: len(transitions) > config.ppo.num_steps)  # and that of the reset
             steps = {step.step_id: step for step in transitions if any(step.valid)}
             wait_until("rewards", lambda: len(rewards) == len(steps))
             ended = {
