@@ -1,4 +1,4 @@
-"""What `train-policy` says to a policy that training in the model could only lower."""
+"""What `train-policy` refuses: a policy that training could only lower, and one that would see nothing."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,3 +33,14 @@ def test_it_is_told_to_stay_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyP
         "acceptance failed (room to learn: done precision, cloned policy - its real success 195/200), going on because "
         "of --force"
     ]
+
+
+@pytest.mark.parametrize(
+    "chosen", [{"from_scratch": False}, {"from_scratch": True, "world_model.object_reader_iterations": 0}]
+)
+def test_a_policy_that_would_see_nothing_is_refused_before_anything_is_collected(chosen: dict[str, Any]) -> None:
+    from_scratch = chosen.pop("from_scratch")
+    arguments: Any = SimpleNamespace(model_dir=None, from_scratch=from_scratch)
+    config = load_config("scenes", {"task": "push", "device": "cpu", "policy.inputs": "state", **chosen})
+    with pytest.raises(ValueError, match="take a model with an object reader"):
+        train_policy._check(arguments, config)

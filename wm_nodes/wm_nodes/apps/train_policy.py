@@ -21,7 +21,7 @@ from wm_nodes.apps.policy_pictures import write_pictures
 from wm_nodes.apps.policy_run import RunContext, is_trained, measured_rate, start_graph, success_rate
 from wm_nodes.config.environments import NO_ENVIRONMENT
 from wm_nodes.config.load import ConfigError, dump_config, load_config, with_judge
-from wm_nodes.config.object_state import with_reader
+from wm_nodes.config.object_state import with_reader, with_truth
 from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT
 from wm_nodes.config.shipped import shipped_model
@@ -35,7 +35,7 @@ from wm_nodes.environments.registry import configured_spec, is_simulated, make_e
 from wm_nodes.judge.backends.factory import judge_name
 from wm_nodes.judge.episode_reward import check_agent, episode_judge
 from wm_nodes.launching.scenarios import IMAGINED
-from wm_nodes.policy_rl.factories import check_model, load_policy, load_steppable
+from wm_nodes.policy_rl.factories import check_inputs, check_model, load_policy, load_steppable
 from wm_nodes.policy_rl.initial_policy import num_starts, prepare_start, start_files
 from wm_nodes.policy_rl.pretraining import make_model
 from wm_nodes.policy_rl.validation.acceptance import accept_model
@@ -200,10 +200,13 @@ def _check(arguments: argparse.Namespace, config: RunConfig) -> None:
         raise ConfigError(f"{arguments.model_dir} holds no {MANIFEST}; name the folder of a trained world model")
     if not config.task:
         _check_without_task(arguments, config)
-    elif not arguments.from_scratch:
+    elif arguments.from_scratch:
+        check_inputs(config, configured_spec(with_truth(config)))
+    else:
         model_dir = Path(arguments.model_dir or shipped_model(config.task))
         spec = configured_spec(with_reader(config, model_dir))
         check_model(spec, model_dir, model_spec(model_dir, read_world_manifest(model_dir)))
+        check_inputs(config, spec)
     for bag in config.sft.bags:
         read_spec(Path(bag))
     if config.model_refresh.num_rounds > 1 and not is_simulated(config):

@@ -116,9 +116,7 @@ def make_policy(config: RunConfig, model_dir: Path | None) -> ImagePolicy:
                          f"{UNTRAINED}")
     encoder = make_encoder(model_dir, config.device, config.policy.inputs)
     spec = run_spec(config, model_dir)
-    if config.policy.inputs == "state" and not spec.measured:
-        raise ValueError("policy.inputs is state, and the state says of nothing but the commanded tool where it is; "
-                         "take a model with an object reader (preset scenes), or latents")
+    check_inputs(config, spec)
     state_range = commanded_range(spec, config.policy)
     if spec.measured:
         recorded = models_of(Path(model_dir), config.device).action.condition
@@ -134,6 +132,13 @@ def make_policy(config: RunConfig, model_dir: Path | None) -> ImagePolicy:
         ignored=[i for i, name in enumerate(spec.state_names) if name in config.policy.ignored_state],
     )
     return policy.to(compute_device(config.device))
+
+
+def check_inputs(config: RunConfig, spec: EnvironmentSpec) -> None:
+    """Raise ValueError for a policy of the state alone where that is all commanded."""
+    if config.policy.inputs == "state" and not spec.measured:
+        raise ValueError("policy.inputs is state, and the state says of nothing but the commanded tool where it is; "
+                         "take a model with an object reader (preset scenes), or latents")
 
 
 def untrained_policy(config: RunConfig) -> ImagePolicy:
