@@ -11,10 +11,10 @@ import torch
 from numpy.testing import assert_array_equal
 from transforms3d.quaternions import mat2quat, qinverse, qmult, quat2axangle
 
+from wm_nodes.config.environments import TRUTH
 from wm_nodes.config.load import load_config
 from wm_nodes.config.object_state import READER
 from wm_nodes.config.scenes import SCENES, scene_of
-from wm_nodes.config.schema import TRUTH
 from wm_nodes.config.seed_ranges import HELDOUT, MODEL_EPISODES
 from wm_nodes.config.tasks import get_task, simulator_part, success
 from wm_nodes.core.rotations import multiply, to_quaternion

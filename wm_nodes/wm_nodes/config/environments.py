@@ -1,21 +1,54 @@
 """What the settings mean that say which environment is real; schema.py has the others."""
 
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
+from wm_nodes.config.scenes import check_scenes
 from wm_nodes.config.sections import EnvironmentName, PositiveFloat, PositiveInt, SettingsSection
 
 NO_ENVIRONMENT = "none"
 """evaluation.environment without an environment."""
 RENDER, CAMERAS = "render", "cameras"
 """gymnasium.pixels of an environment whose picture is what it renders, or what the cameras show."""
+TRUTH = "truth"
+"""Of simulation.object_state: as the simulator knows it."""
+ScenesName = Annotated[str, AfterValidator(check_scenes)]
+"""Name of a split or of a scene, see config/scenes.py."""
 
 
 class EnvironmentConfig(SettingsSection):
     factory: EnvironmentName
     """The real environment: a name of environments/registry.py, or module:callable. The environment node serves it as
     backend `environment`; where no task is named, its spec is that of policies and recordings."""
+
+
+class SimulationConfig(SettingsSection):
+    scenes: ScenesName = ""
+    """Of which scenes an episode has one, by its reset seed: a split of config/scenes.json, or one scene's name. Empty:
+    the task has a scene of its own."""
+    cameras: list[Literal["side", "near", "front", "wrist"]]
+    """Rendered side by side, left to right, in every observation."""
+    image_size: PositiveInt
+    """Height and width of one camera image, px."""
+    control_hz: PositiveFloat
+    """Policy and world-model steps per simulated second."""
+    max_action_m: PositiveFloat
+    """Displacement of the commanded tool position by a full-scale action, m per axis and step."""
+    max_action_rad: PositiveFloat = 0.2
+    """Rotation of the commanded tool by a full-scale action, rad per axis and step; only where Task.actions is pose."""
+    workspace_low_m: tuple[float, float, float]
+    """Lower corner (x, y, z) of the box that the commanded tool position stays in, robot base frame, m."""
+    workspace_high_m: tuple[float, float, float]
+    """Upper corner of that box."""
+    max_episode_steps: PositiveInt
+    """An episode is truncated after this many steps."""
+    render_device: str
+    """SAPIEN render device; `auto` takes a GPU when there is one, else the software device."""
+    object_state: str = ""
+    """Where the state says, beside the commanded tool, where the things are that the task names: truth: as the
+    simulator knows it; a file: as that reader (environments/object_reader.py) sees it in the picture. Empty: it does
+    not say it, or, in a world model's folder with a reader, as that reader sees it."""
 
 
 class CameraView(SettingsSection):

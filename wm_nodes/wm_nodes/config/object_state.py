@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from wm_nodes.config.schema import TRUTH, RunConfig
+from wm_nodes.config.environments import TRUTH
+from wm_nodes.config.schema import RunConfig
 
 READER = "object_reader.safetensors"
 """In a world model's folder."""

@@ -7,10 +7,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from wm_nodes.config.environments import EnvironmentConfig, GymnasiumConfig
+from wm_nodes.config.environments import EnvironmentConfig, GymnasiumConfig, ScenesName, SimulationConfig
 from wm_nodes.config.judge import JudgeConfig
 from wm_nodes.config.measurement import AcceptanceConfig, EvaluationConfig, ExploitMeterConfig, ModelRefreshConfig
-from wm_nodes.config.scenes import check_scenes
 from wm_nodes.config.sections import (
     FactoryName,
     Fraction,
@@ -24,8 +23,6 @@ from wm_nodes.config.tasks import check_task, instruction
 
 AGENT = "agent"
 """Name of the reward agent among the rewards of both loops."""
-TRUTH = "truth"
-"""Of simulation.object_state: as the simulator knows it."""
 EXECUTION = "execution"
 """Name of the reward of clips by an action world model, see video_rl/execution_reward.py."""
 
@@ -34,40 +31,10 @@ TaskName = Annotated[
 ]
 """Name of a task's file, see config/tasks.py. Empty: there is none, and `simulation` is not read; everything follows
 the spec of the environment, of its recordings or of the model that was trained on them."""
-ScenesName = Annotated[str, AfterValidator(check_scenes)]
-"""Name of a split or of a scene, see config/scenes.py."""
 PolicyInputs = Literal["latents", "positions", "both", "state"]
 """What a policy sees of a picture, see PolicyConfig.inputs."""
 DeviceName = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 """Where models compute: cpu, cuda, cuda:N, or auto (a GPU where there is one), see core/device.py."""
-
-
-class SimulationConfig(SettingsSection):
-    scenes: ScenesName = ""
-    """Of which scenes an episode has one, by its reset seed: a split of config/scenes.json, or one scene's name. Empty:
-    the task has a scene of its own."""
-    cameras: list[Literal["side", "near", "front", "wrist"]]
-    """Rendered side by side, left to right, in every observation."""
-    image_size: PositiveInt
-    """Height and width of one camera image, px."""
-    control_hz: PositiveFloat
-    """Policy and world-model steps per simulated second."""
-    max_action_m: PositiveFloat
-    """Displacement of the commanded tool position by a full-scale action, m per axis and step."""
-    max_action_rad: PositiveFloat = 0.2
-    """Rotation of the commanded tool by a full-scale action, rad per axis and step; only where Task.actions is pose."""
-    workspace_low_m: tuple[float, float, float]
-    """Lower corner (x, y, z) of the box that the commanded tool position stays in, robot base frame, m."""
-    workspace_high_m: tuple[float, float, float]
-    """Upper corner of that box."""
-    max_episode_steps: PositiveInt
-    """An episode is truncated after this many steps."""
-    render_device: str
-    """SAPIEN render device; `auto` takes a GPU when there is one, else the software device."""
-    object_state: str = ""
-    """Where the state says, beside the commanded tool, where the things are that the task names: truth: as the
-    simulator knows it; a file: as that reader (environments/object_reader.py) sees it in the picture. Empty: it does
-    not say it, or, in a world model's folder with a reader, as that reader sees it."""
 
 
 class DataConfig(SettingsSection):

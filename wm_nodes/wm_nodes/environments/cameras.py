@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.environments import SimulationConfig
 from wm_nodes.core.cameras import CameraModel
 from wm_nodes.core.types import FloatArray
 from wm_nodes.environments.maniskill.behaviours import ROBOT_BASE as ROBOT_BASE

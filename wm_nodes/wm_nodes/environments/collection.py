@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.environments import SimulationConfig
 from wm_nodes.config.seed_ranges import EVALUATION
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream

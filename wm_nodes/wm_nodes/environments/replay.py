@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.environments import SimulationConfig
 from wm_nodes.config.tasks import success, truth_columns
 from wm_nodes.core.tool_control import hold_actions
 from wm_nodes.core.types import BoolArray, FloatArray

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.environments import SimulationConfig
 from wm_nodes.config.tasks import get_task
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.types import FloatArray

@@ -59,6 +59,12 @@ class ActionCondition(nn.Module):
         self.register_buffer("state_mean", torch.zeros(state_dim))
         self.register_buffer("state_scale", torch.ones(state_dim))
 
+    @torch.no_grad()
+    def fit_states(self, states_FS: Tensor) -> None:
+        """Let recorded states (F, S) span [-1, 1], before any training."""
+        self.state_mean.copy_((states_FS.amax(0) + states_FS.amin(0)) / 2)
+        self.state_scale.copy_(((states_FS.amax(0) - states_FS.amin(0)) / 2).clamp_min(1e-3))
+
     def forward(self, actions_BTA: Tensor, states_BTS: Tensor, next_states_BTS: Tensor) -> Tensor:
         """Tokens (B, T, A + 2 S + 1, D); actions in [-1, 1], states in m."""
         before, after = ((s - self.state_mean) / self.state_scale for s in (states_BTS, next_states_BTS))

@@ -25,6 +25,7 @@ from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.positions import num_positions_of
 from wm_nodes.world_model.sentence_encoder import SentenceCondition
+from wm_nodes.world_model.state_change import state_sizes
 from wm_nodes.world_model.text import TextModel
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
@@ -136,10 +137,12 @@ def load_model_folder(
     num_tasks, spec = len(manifest["tasks"]), model_spec(folder, manifest)
     num_positions = num_positions_of(spec, success_state=tokenizer_config.success_state)
     tokenizer = Tokenizer(tokenizer_config, spec.height, spec.width, num_positions)
-    sizes = {"num_tokens": tokenizer.num_tokens, "latent_dim": tokenizer.latent_dim, "num_positions": num_positions}
+    sizes: dict[str, Any] = {
+        "num_tokens": tokenizer.num_tokens, "latent_dim": tokenizer.latent_dim, "num_positions": num_positions,
+    }
     action = action_model_class(tokenizer_config.kind)(
-        config, action_dim=spec.action_dim, state_dim=spec.state_dim, num_tasks=num_tasks, measured=spec.measured,
-        differences=spec.differences, **sizes
+        config, action_dim=spec.action_dim, state_dim=spec.state_dim, num_tasks=num_tasks, **state_sizes(spec),
+        **sizes,
     )
     _load(folder, "tokenizer", tokenizer, manifest)
     if rollout_decoder and "decoder" in manifest["sha256"]:

@@ -4,11 +4,18 @@ Shapes: ... any batch, S tokens, D values per token, A action, P state, M measur
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from wm_nodes.core.differences import Differences
+from wm_nodes.core.specs import EnvironmentSpec
+
+
+def state_sizes(spec: EnvironmentSpec) -> dict[str, Any]:
+    """What an action model is told of a spec's state, beside its size."""
+    return {"measured": spec.measured, "differences": spec.differences}
 
 
 class StateChange(nn.Module):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from transforms3d.quaternions import quat2mat
 
-from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.environments import SimulationConfig
 from wm_nodes.core.cameras import CameraModel, Matrix, intrinsics, look_at
 from wm_nodes.core.rotations import to_quaternion
 from wm_nodes.environments.maniskill.behaviours import ROBOT_BASE

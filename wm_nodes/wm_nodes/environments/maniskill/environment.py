@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
 
+from wm_nodes.config.environments import TRUTH, SimulationConfig
 from wm_nodes.config.scenes import Scene, scene_of
-from wm_nodes.config.schema import TRUTH, SimulationConfig
 from wm_nodes.config.seed_ranges import UNSEEDED
 from wm_nodes.config.tasks import get_task, part_of, simulator_part, success
 from wm_nodes.core.cameras import CameraModel, Matrix

@@ -18,7 +18,7 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.registration import register_env
 
-from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.environments import SimulationConfig
 from wm_nodes.environments.maniskill.backend import render_backend
 from wm_nodes.environments.maniskill.cameras import PLACEMENTS
 

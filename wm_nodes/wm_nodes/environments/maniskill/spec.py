@@ -1,6 +1,6 @@
 """The spec of a task in ManiSkill."""
 
-from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.environments import SimulationConfig
 from wm_nodes.config.tasks import get_task, instruction, simulator_part
 from wm_nodes.core.action_spaces import MAX_TILT_RAD, MAX_YAW_RAD, SPACES, ActionSpace
 from wm_nodes.core.specs import SOURCE_SIMULATOR, TASK_PREFIX, EnvironmentSpec

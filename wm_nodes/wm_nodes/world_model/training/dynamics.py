@@ -9,7 +9,7 @@ phase of its own in each episode, so every recorded frame is used in every itera
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -21,10 +21,9 @@ from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.background import BackgroundBatches
 from wm_nodes.training.loop import TrainingLoop
-from wm_nodes.world_model.conditions import ActionCondition
 from wm_nodes.world_model.dynamics import ActionModel, FrameModel, Prediction
 from wm_nodes.world_model.precision import compute_context, has_fast_bfloat16
-from wm_nodes.world_model.state_change import StateChange
+from wm_nodes.world_model.state_change import StateChange, state_sizes
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.device_rollout import roll_out_on_device
@@ -188,24 +187,13 @@ def new_model(
         model = kind(
             settings, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
             action_dim=data.actions.shape[-1], state_dim=data.states.shape[-1], num_tasks=data.success.shape[-1],
-            num_positions=data.truth.shape[-1], **state_sizes(spec),
+            num_positions=data.truth.shape[-1], **(state_sizes(spec) if spec else {}),
         )
-    fit_states(model.condition, data.states.flatten(0, 1))
+    model.condition.fit_states(data.states.flatten(0, 1))
     if model.state_change is not None:
         before, after = data.states[:, :-1][data.step_mask], data.states[:, 1:][data.step_mask]
         model.state_change.fit_scale(before, after - before)
     return model.to(tokenizer.device)
-
-
-def fit_states(condition: ActionCondition, states_FP: Tensor) -> None:
-    """Let states (F, P) span [-1, 1]."""
-    condition.state_mean.copy_((states_FP.amax(0) + states_FP.amin(0)) / 2)
-    condition.state_scale.copy_(((states_FP.amax(0) - states_FP.amin(0)) / 2).clamp_min(1e-3))
-
-
-def state_sizes(spec: EnvironmentSpec | None) -> dict[str, Any]:
-    """What a model is told of the state, beside its size."""
-    return {"measured": spec.measured, "differences": spec.differences} if spec else {}
 
 
 def state_change_loss(change: StateChange, part: LatentEpisodes) -> Tensor:
