@@ -14,7 +14,8 @@ from wm_nodes.policy_rl.device_rollout import DeviceCollector
 from wm_nodes.policy_rl.factories import make_endogenous_reward, make_policy, make_training_environment
 from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.world_model import ActionModel, Tokenizer, save_model_folder
-from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
+from wm_nodes.world_model.training.dynamics import train_action_model
+from wm_nodes.world_model.training.latent_episodes import tokenise_episodes
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
 
 TOY = {

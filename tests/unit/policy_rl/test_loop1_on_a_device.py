@@ -34,7 +34,8 @@ from wm_nodes.policy_rl.validation.evaluation import evaluate
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.weights import load_weights, pack_weights
 from wm_nodes.world_model import save_model_folder
-from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
+from wm_nodes.world_model.training.dynamics import train_action_model
+from wm_nodes.world_model.training.latent_episodes import tokenise_episodes
 from wm_nodes.world_model.training.position_probe import train_position_probe
 from wm_nodes.world_model.training.text import train_text_model
 from wm_nodes.world_model.training.token_dynamics import train_token_model

@@ -73,7 +73,8 @@ def test_a_model_from_scratch_is_collected_in_parallel_and_resumed_where_it_stop
 @pytest.mark.rendering
 def test_one_model_is_made_of_the_episodes_of_several_tasks_and_measured_on_every_split(tmp_path: Path) -> None:
     small = {"data.num_episodes": 2, "data.num_heldout": 1, "tokenizer.num_iterations": 2, "data.num_workers": 1,
-             "data.num_scattered": 1, "tokenizer.probe_iterations": 2, "world_model.object_reader_iterations": 2}
+             "data.num_scattered": 1, "tokenizer.probe_iterations": 2, "world_model.object_reader_iterations": 2,
+             "world_model.state_model_iterations": 2}
     config = load_config("smoke", {
         "task": "push", "data.behaviours": {"expert": 1.0}, "world_model.num_iterations": 2,
         "simulation.max_episode_steps": 12, **small,
@@ -83,7 +84,8 @@ def test_one_model_is_made_of_the_episodes_of_several_tasks_and_measured_on_ever
     assert models.tasks == ("move_to_aim", "pick_place", "pull", "push", "reach_object")
     assert story["data"]["episodes"] == 10 and story["data"]["policy_episodes"] == 0
     reader = load_object_reader(folder / READER, models.spec)
-    assert models.spec.measured and reader.views == 2 and story["training"]["object_reader"]["error_m"] > 0
+    assert reader.views == 2 and story["training"]["object_reader"]["error_m"] > 0
+    assert models.spec.measured and models.action.state_model is not None
     for split in ("heldout", "heldout_ood_object", "heldout_ood_combo"):
         assert {task: values["episodes"] for task, values in story[split].items()} == dict.fromkeys(models.tasks, 1)
         assert "done_push_auc" in story[split]["push"] and "done_pull_auc" not in story[split]["push"]

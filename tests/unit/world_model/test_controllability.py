@@ -12,7 +12,8 @@ from wm_nodes.config.load import load_config
 from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.world_model import WorldModels
-from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
+from wm_nodes.world_model.training.dynamics import train_action_model
+from wm_nodes.world_model.training.latent_episodes import tokenise_episodes
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
 from wm_nodes.world_model.validation.controllability import controllability_metrics, follow
 from wm_nodes.world_model.validation.open_loop import imagine_episodes

@@ -14,7 +14,7 @@ from wm_nodes.world_model import load_model_folder, save_model_folder
 from wm_nodes.world_model.decoding import choose_codes, code_parts, code_targets, decided_after, decode_frame
 from wm_nodes.world_model.quantizer import indices_to_bits
 from wm_nodes.world_model.token_dynamics import TokenActionModel
-from wm_nodes.world_model.training.dynamics import tokenise_episodes
+from wm_nodes.world_model.training.latent_episodes import tokenise_episodes
 from wm_nodes.world_model.training.token_dynamics import MAX_CORRUPTION, corrupt, mask_tokens, train_token_model
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
 from wm_nodes.world_model.validation.open_loop import evaluate_rollouts, imagine_episodes

@@ -27,7 +27,6 @@ def make_models() -> tuple[ActionModel, Tokenizer]:
     tokenizer = Tokenizer(config.tokenizer, 16, 32)
     model = ActionModel(
         config.world_model, num_tokens=tokenizer.num_tokens, latent_dim=8, action_dim=3, state_dim=3, num_tasks=2,
-        differences=((0, 1),),
     )
     with torch.no_grad():
         for parameter in model.parameters():
@@ -51,11 +50,10 @@ def make_inputs(tokenizer: Tokenizer) -> Inputs:
 
 def roll_out_on_cpu(model: ActionModel, tokenizer: Tokenizer, inputs: Inputs) -> RolloutTerms:
     real, anchors, given = inputs
-    condition, seen, caches = model.condition(*given), model.done_state(given[2]), model.trunk.new_caches()
-    assert seen is not None
+    condition, caches = model.condition(*given), model.trunk.new_caches()
 
     def predict(t: int, latents: Tensor) -> Prediction:
-        return model.predict(latents, condition[:, t : t + 1], caches, state_BTN=seen[:, t : t + 1])
+        return model.predict(latents, condition[:, t : t + 1], caches)
 
     def choose_input(t: int, frame: Tensor) -> Tensor:
         return torch.where(anchors[:, t, None, None, None], real[:, t : t + 1], frame)
@@ -79,9 +77,9 @@ def both(dtype: torch.dtype) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     on_cpu = results(roll_out_on_cpu(model, tokenizer, inputs), model)
     model.zero_grad()
     real, anchors, given = inputs
-    condition, seen = model.condition(*given), model.done_state(given[2])
+    condition = model.condition(*given)
     terms = RolloutTerms(
-        *roll_out_on_device(model, tokenizer, real, anchors, condition, dtype, state_BTN=seen)
+        *roll_out_on_device(model, tokenizer, real, anchors, condition, dtype)
     )
     return on_cpu, results(terms, model)
 

@@ -21,7 +21,8 @@ from wm_nodes.world_model.dynamics import ActionModel, Prediction
 from wm_nodes.world_model.imagined_environment import imagine_start_goals
 from wm_nodes.world_model.text import MAX_WORDS
 from wm_nodes.world_model.training.device_rollout import roll_out_on_device
-from wm_nodes.world_model.training.dynamics import LatentEpisodes, new_model, roll_out, tokenise_episodes
+from wm_nodes.world_model.training.dynamics import new_model, roll_out
+from wm_nodes.world_model.training.latent_episodes import LatentEpisodes, tokenise_episodes
 from wm_nodes.world_model.training.text import golden_rows, row_instructions, train_text_model
 
 TASKS = ("reach", "push_cube")

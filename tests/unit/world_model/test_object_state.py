@@ -1,4 +1,4 @@
-"""Where things are, as part of the state: the model predicts it, its done heads and policies see it."""
+"""Where things are, as part of the state: a model of states predicts it and the done signal, policies see it."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch.nn import functional as F
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
@@ -14,21 +13,29 @@ from wm_nodes.core.differences import NEAR_M, Differences
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.environments.registry import configured_spec
-from wm_nodes.policy_rl.factories import make_policy
+from wm_nodes.policy_rl.device_rollout import DeviceCollector, make_collector
+from wm_nodes.policy_rl.factories import make_endogenous_reward, make_policy
+from wm_nodes.policy_rl.rollouts import TensorRollout, collect_rollout
 from wm_nodes.world_model import (
     ActionModel,
     DeviceEnvironment,
     ImaginedEnvironment,
     Tokenizer,
+    WorldModels,
     load_model_folder,
     save_model_folder,
 )
-from wm_nodes.world_model.state_change import StateChange
+from wm_nodes.world_model.dynamics import done_signal
+from wm_nodes.world_model.state_model import StateModel
+from wm_nodes.world_model.token_dynamics import TokenActionModel
+from wm_nodes.world_model.training import state_model as training
+from wm_nodes.world_model.training.latent_episodes import LatentEpisodes
+from wm_nodes.world_model.training.state_model import train_state_model
 
 SETTINGS = {
     "task": "push", "simulation.object_state": "truth", "policy.inputs": "state", "tokenizer.width": 16,
     "tokenizer.latent_dim": 8, "world_model.width": 16, "world_model.num_heads": 2, "world_model.depth": 1,
-    "world_model.object_reader_iterations": 1,
+    "world_model.object_reader_iterations": 1, "world_model.state_model_iterations": 1,
 }
 
 
@@ -66,52 +73,107 @@ def test_a_difference_is_seen_in_multiples_of_what_is_near() -> None:
     torch.testing.assert_close(seen, torch.tensor([[0.0, 0.0, 0.0, 0.2 / NEAR_M]]))
 
 
-def test_what_nothing_touches_hardly_drifts() -> None:
-    """A tool pushes small things on a table along x: what it does not touch stays, better than in a plain network."""
-    stream, errors = numpy_stream(0, "pushes"), []
-    tool, thing = torch.from_numpy(stream.uniform(-0.3, 0.3, (2, 1024, 2)).astype(np.float32))
-    thing[::2] = tool[::2] + 0.2 * thing[::2]
-    way = torch.tensor([0.03, 0.0])
-    touched = ((thing - tool - way / 2).abs() < 0.03).all(1, keepdim=True)
-    states, after = torch.cat((tool, thing), 1), torch.cat((tool + way, thing + touched * way), 1)
-    latents, actions = torch.zeros(1024, 1, 1), torch.ones(1024, 1)
-    for differences in ((), ((0, 2), (1, 3))):
-        torch.manual_seed(0)
-        change = StateChange(1, 4, 1, (2, 3), differences)
-        change.fit_scale(states, after - states)
-        optimizer = torch.optim.Adam(change.parameters(), 3e-3)
-        for _ in range(100):
-            found = change(latents, actions, states)
-            loss = F.huber_loss(found, change.wanted(states, after), delta=change.delta)
-            optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            optimizer.step()
-        with torch.no_grad():
-            there = change.next_states(latents, actions, states, after)
-        errors.append(float((there - after)[~touched[:, 0], 2].abs().mean()))
-    assert errors[1] < 0.5 * errors[0]
+def test_a_model_of_states_learns_a_push_and_its_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tool pushes small things on a table along x; those that end beyond a line have won."""
+    stream, way, steps = numpy_stream(0, "pushes"), torch.tensor([0.03, 0.0]), 6
+    tool, thing = torch.from_numpy(stream.uniform(-0.3, 0.3, (2, 512, 2)).astype(np.float32))
+    thing[::2] = tool[::2] + torch.tensor([0.08, 0.0]) + 0.1 * thing[::2]
+    frames = [torch.cat((tool, thing), 1)]
+    for _ in range(steps):
+        touched = ((thing - tool - way / 2).abs() < 0.03).all(1, keepdim=True)
+        tool, thing = tool + way, thing + touched * way
+        frames.append(torch.cat((tool, thing), 1))
+    states = torch.stack(frames, 1)
+    moved = (states[:, -1, 2] - states[:, 0, 2]).abs() > 0.01
+    won = states[..., 2:3] > 0.1
+    data = LatentEpisodes(
+        torch.zeros(512, 1, 1, 1, 3), torch.zeros(512, steps + 1, 1, 1), torch.zeros(1), states,
+        torch.zeros(512, steps, 1), won, torch.ones(512, 1), torch.zeros(512, steps + 1, 0),
+        torch.ones(512, steps, dtype=torch.bool),
+    )
+    torch.manual_seed(0)
+    model = StateModel(4, (2, 3), ((0, 2), (1, 3)), num_tasks=1, num_heads=2)
+    model.fit_scale(states[:, :-1].flatten(0, 1), (states[:, 1:] - states[:, :-1]).flatten(0, 1))
+    monkeypatch.setattr(training, "READING_NOISE_M", 0.0)
+    metrics = train_state_model(model, data, 400, 0, None)
+    assert metrics["loss"] == pytest.approx(metrics["change"] + metrics["done"])
+    earlier = now = states[:, 0]
+    with torch.no_grad():
+        for t in range(steps):
+            earlier, now = now, model.next_states(now, earlier, states[:, t + 1])
+        signal, _ = done_signal(model.done_logits(now))
+    errors = (now - states[:, -1])[:, 2].abs()
+    travelled = (states[:, -1] - states[:, 0])[moved, 2].mean()
+    assert errors[~moved].mean() < 0.005 and errors[moved].mean() < 0.25 * travelled
+    assert ((signal > 0.5) == won[:, -1]).float().mean() > 0.9
 
 
-def test_done_heads_see_the_state_and_the_model_moves_what_is_measured(config: RunConfig, tmp_path: Path) -> None:
-    models, spec = load_model_folder(folder_of(config, tmp_path)), configured_spec(config)
+def told_models(config: RunConfig, path: Path) -> tuple[WorldModels, tuple[np.ndarray, np.ndarray]]:
+    """A model of states and two starts; its weights are noise, so that done signals differ."""
+    spec = configured_spec(config)
+    folder = folder_of(config, path)
+    models = load_model_folder(folder)
+    assert models.action.state_model is not None and models.action.state_change is None
+    with torch.no_grad():
+        for parameter in models.action.state_model.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0)))
     images = numpy_stream(0, "pictures").integers(0, 256, (2, spec.height, spec.width, 3), np.uint8)
     states = np.full((2, spec.state_dim), 0.5, np.float32)
     states[1, spec.state_names.index("object_x")] += 0.2
-    signals = []
-    for rows in (states, states[::-1].copy()):
-        env = ImaginedEnvironment(models, spec, (images[:1].repeat(2, 0), rows), config.reward, num_envs=2, seed=0)
+    return models, (images, states)
+
+
+def test_the_model_moves_what_is_measured_and_its_signal_is_of_the_state_alone(
+    config: RunConfig, tmp_path: Path
+) -> None:
+    models, (images, states) = told_models(config, tmp_path)
+    spec, made = configured_spec(config), []
+    for pictures in (images, images[::-1].copy()):
+        env = ImaginedEnvironment(models, spec, (pictures, states), config.reward, num_envs=2, seed=0)
         env.reset(seeds=np.array([0, 1], np.uint64))
         begun = env.current().state
-        made = env.step(np.zeros((2, spec.action_dim), np.float32))
-        signals.append(made.success_probability)
-        after = made.observation.state
+        made.append(env.step(np.zeros((2, spec.action_dim), np.float32)))
+        after = made[-1].observation.state
         assert (after[:, spec.measured] != begun[:, spec.measured]).any()
         np.testing.assert_array_equal(after[:, : spec.commanded_dim - 1], begun[:, : spec.commanded_dim - 1])
-    assert not np.array_equal(*signals) or signals[0][0] != signals[0][1]
-    device = DeviceEnvironment.beside(env)
-    with torch.inference_mode():
-        device.reset(torch.ones(2, dtype=torch.bool), env.episodes.starts_N)
-        assert device.encode("state").shape == (2, 0)
+    np.testing.assert_array_equal(made[0].success_probability, made[1].success_probability)
+    assert len(set(made[0].success_probability.tolist())) == len({*env.episodes.starts_N.tolist()})
+    assert not np.array_equal(made[0].observation.image, made[1].observation.image)
+
+
+def test_without_pictures_everything_else_is_the_same(config: RunConfig, tmp_path: Path) -> None:
+    models, starts = told_models(config, tmp_path)
+    spec = configured_spec(config)
+    env = ImaginedEnvironment(models, spec, starts, config.reward, num_envs=2, seed=0)
+    policy = make_policy(config, tmp_path)
+    reward = make_endogenous_reward(config, tmp_path)
+    dark = make_collector(env, policy, reward)(4, 0, 1)
+    assert isinstance(dark, TensorRollout) and dark.images is None
+    with pytest.raises(ValueError, match="this rollout has no pictures"):
+        dark.pictures()
+    seen = collect_rollout(env, policy, reward, 4, 0, 1)
+    for name in ("states", "actions", "logprobs", "rewards", "valid"):
+        ours, theirs = getattr(dark, f"{name}_TN").numpy(), getattr(seen, f"{name}_TN")
+        np.testing.assert_array_equal(ours, theirs, name)
+    assert (seen.images_TN[1:] != seen.images_TN[:-1]).any()
+
+
+def test_who_looks_has_pictures(config: RunConfig, tmp_path: Path) -> None:
+    models, starts = told_models(config, tmp_path)
+    env = DeviceEnvironment(models, configured_spec(config), starts, config.reward, num_envs=2, with_goals=False)
+    reward = make_endogenous_reward(config, tmp_path)
+    looking = make_policy(config.with_values(policy=config.policy.with_values(inputs="latents")), tmp_path)
+    assert DeviceCollector(env, looking, reward).collect(2, 0, 1).images is not None
+    assert DeviceCollector(env, make_policy(config, tmp_path), reward).collect(2, 0, 1).images is None
+
+
+def test_a_model_of_states_needs_a_state_that_says_something(config: RunConfig) -> None:
+    plain = config.with_values(simulation=config.simulation.with_values(object_state=""))
+    tokenizer = Tokenizer(config.tokenizer, 64, 128)
+    with pytest.raises(ValueError, match=r"all of this one is commanded; set simulation\.object_state"):
+        model_of(plain, configured_spec(plain), tokenizer)
+    with pytest.raises(ValueError, match=r"goes with tokenizer\.kind continuous alone"):
+        TokenActionModel(config.world_model, num_tokens=4, latent_dim=8, action_dim=1, state_dim=2, num_tasks=1)
 
 
 def test_a_policy_of_the_state_sees_nothing_of_the_picture(config: RunConfig, tmp_path: Path) -> None:
@@ -128,7 +190,10 @@ def test_a_policy_of_the_state_sees_nothing_of_the_picture(config: RunConfig, tm
 
 
 def test_a_policy_that_would_see_the_commanded_tool_alone_is_refused(config: RunConfig, tmp_path: Path) -> None:
-    plain = config.with_values(simulation=config.simulation.with_values(object_state=""))
+    plain = config.with_values(
+        simulation=config.simulation.with_values(object_state=""),
+        world_model=config.world_model.with_values(state_model_iterations=0),
+    )
     with pytest.raises(ValueError, match="take a model with an object reader"):
         make_policy(plain, folder_of(plain, tmp_path))
 

@@ -19,21 +19,16 @@ from wm_nodes.training.loop import EMA_DECAY, TrainingLoop
 from wm_nodes.world_model import load_model_folder, save_model_folder, save_refreshed_folder
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.decoder import predict_all, train_decoder
+from wm_nodes.world_model.training.done import bootstrap_masks, done_losses, done_mask
 from wm_nodes.world_model.training.dynamics import (
-    LatentEpisodes,
     RolloutTerms,
-    bootstrap_masks,
     decoded_losses,
-    done_losses,
-    done_mask,
-    first_frames,
     rollout_steps_at,
     shown_frames,
     token_weights,
-    tokenise_episodes,
-    tool_moves,
     train_action_model,
 )
+from wm_nodes.world_model.training.latent_episodes import LatentEpisodes, first_frames, tokenise_episodes, tool_moves
 from wm_nodes.world_model.training.position_probe import train_position_probe
 from wm_nodes.world_model.training.state_probe import train_state_probe
 from wm_nodes.world_model.training.text import train_text_model

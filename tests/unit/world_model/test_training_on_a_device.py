@@ -14,7 +14,8 @@ from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.decoder import train_decoder
-from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
+from wm_nodes.world_model.training.dynamics import train_action_model
+from wm_nodes.world_model.training.latent_episodes import tokenise_episodes
 from wm_nodes.world_model.training.text import train_text_model
 
 STEPS = 16

@@ -52,7 +52,7 @@ class EmbeddingHead(nn.Module):
         self.register_buffer("weights", torch.from_numpy(weights).float())
 
     def forward(
-        self, tokens_BTSD: Tensor, register_BTD: Tensor, state_BTN: Tensor | None = None
+        self, tokens_BTSD: Tensor, register_BTD: Tensor, told_BTKJ: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """The logit of the value (B, T, K, J), inside (0, 1), and no positions."""
         pooled = pooled_features(tokens_BTSD, register_BTD).float()

@@ -29,7 +29,8 @@ from wm_nodes.policy_rl.factories import (
 from wm_nodes.policy_rl.rollouts import collect_rollout
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.loop import LossFunction, TrainingLoop
-from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
+from wm_nodes.world_model.training.dynamics import train_action_model
+from wm_nodes.world_model.training.latent_episodes import tokenise_episodes
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
 
 EAGER, CAPTURED, HOST_LOOP = "eager", "captured", "loop over host arrays"

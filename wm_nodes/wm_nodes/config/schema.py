@@ -144,6 +144,10 @@ class WorldModelConfig(SettingsSection):
     no positions at all, also not in the losses of decoded_weight."""
     decoded_weight: NonNegativeFloat
     """Weight of the losses on predicted frames after decoding, and after encoding them again (0: off)."""
+    state_model_iterations: NonNegativeInt = 0
+    """Gradient steps of a small model of states alone, which predicts them and the done signal, in float32 (RS-1g); RL
+    of policies that see the state alone then imagines no pictures. 0: none. For states that say where everything is
+    that success depends on, and tokenizer.kind continuous."""
     object_reader_iterations: NonNegativeInt = 0
     """Gradient steps of a reader of where things are, which makes that part of the state (simulation.object_state). 0:
     none. Of models that collect their own episodes, in tasks with SimulatorPart.object_state."""

@@ -60,13 +60,22 @@ def rollout_starts(
 def make_collector(
     env: Environment | DeviceEnvironment, policy: ImagePolicy, reward: RewardModel, envs_per_start: int = 1
 ) -> Callable[[int, int, int], Rollout | TensorRollout]:
-    """Return collect(steps, seed, policy version): on the device where `env` is a DeviceEnvironment, or the reward
-    follows golden trajectories, which stay there; else lock-step."""
-    if isinstance(env, ImaginedEnvironment) and isinstance(reward, EndogenousReward) and reward.config.needs_golden:
+    """Return collect(steps, seed, policy version): on the device where `env` is a DeviceEnvironment, the reward follows
+    golden trajectories, which stay there, or nobody needs pictures; else lock-step."""
+    if isinstance(env, ImaginedEnvironment) and isinstance(reward, EndogenousReward) and (
+        reward.config.needs_golden or (needs_no_pictures(env.episodes, policy, reward) and not env.picture_noise)
+    ):
         env = DeviceEnvironment.beside(env)
     if isinstance(env, DeviceEnvironment):
         return partial(DeviceCollector(env, policy, reward).collect, envs_per_start=envs_per_start)
     return partial(collect_rollout, env, policy, reward, envs_per_start=envs_per_start)
+
+
+def needs_no_pictures(env: DeviceEnvironment, policy: ImagePolicy, reward: RewardModel) -> bool:
+    """Whether episodes are the same without pictures, which are most of the work: states alone say what happens
+    (world_model.state_model_iterations), and nobody looks."""
+    pays_for_states = isinstance(reward, EndogenousReward) and reward.config.dense_weight == 0
+    return env.is_told and policy.encoder.inputs == "state" and pays_for_states
 
 
 class DeviceCollector:
@@ -88,6 +97,7 @@ class DeviceCollector:
     ) -> None:
         self.env, self.policy = env, policy
         self._reward = _checked(reward, policy, env)
+        env.pictures = not needs_no_pictures(env, policy, reward)
         self._goals = self._encode_goals()
         num_envs, device = env.spec.num_envs, env.device
 
@@ -97,11 +107,13 @@ class DeviceCollector:
         self._noise_NA, self._starts_N = zeros(env.spec.action_dim), zeros(dtype=torch.int64)
         self._begins_N, self._just_ended_N = zeros(dtype=torch.bool), zeros(dtype=torch.bool)
         self._row: dict[str, Tensor] = {
-            "images": torch.zeros_like(env.frames_NHWC), "features": zeros(policy.encoder.feature_dim),
+            "features": zeros(policy.encoder.feature_dim),
             "states": zeros(env.spec.state_dim), "actions": zeros(env.spec.action_dim), "logprobs": zeros(),
             "values": zeros(), "signal": zeros(), "uncertainty": zeros(), "terminated": zeros(dtype=torch.bool),
             "truncated": zeros(dtype=torch.bool), "valid": zeros(dtype=torch.bool), "starts": zeros(dtype=torch.int64),
         }
+        if env.pictures:
+            self._row["images"] = torch.zeros_like(env.frames_NHWC)
         if self._goals is not None and policy.encoder.inputs == "positions":  # the reward compares latents
             self._row["latents"] = zeros(self._goals[0].shape[-1])
         self._run = self._captured(capture or (partial(capture_graph, device) if device.type == "cuda" else None))
@@ -151,7 +163,8 @@ class DeviceCollector:
             self._run()
             for name, column in columns.items():
                 column[step].copy_(self._row[name])
-        columns["images"][-1].copy_(env.frames_NHWC)
+        if "images" in columns:
+            columns["images"][-1].copy_(env.frames_NHWC)
         columns["features"][-1].copy_(self._features())
         columns["states"][-1].copy_(env.states_NP)
         if "latents" in columns:
@@ -162,7 +175,7 @@ class DeviceCollector:
         return TensorRollout(
             features[:-1], features[1:], states[:-1], states[1:], columns["actions"], columns["logprobs"],
             columns["values"], rewards, columns["terminated"], columns["truncated"], columns["valid"] & rewarded,
-            policy_version, columns["images"],
+            policy_version, columns.get("images"),
         )
 
     def _captured(self, capture: Callable[[Step], Step] | None) -> Step:
@@ -184,9 +197,11 @@ class DeviceCollector:
         distribution = policy.distribution(features, env.states_NP)
         actions = distribution.executed(self._noise_NA)
         self._put(
-            images=env.frames_NHWC, features=features, states=env.states_NP, actions=actions,
+            features=features, states=env.states_NP, actions=actions,
             logprobs=distribution.logprob(actions), values=policy.value(features, env.states_NP), starts=env.starts_N,
         )
+        if "images" in self._row:
+            self._put(images=env.frames_NHWC)
         if "latents" in self._row:
             self._put(latents=env.encode())
         result = env.step(actions)

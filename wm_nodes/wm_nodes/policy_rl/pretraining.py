@@ -46,11 +46,12 @@ from wm_nodes.world_model import ActionModel, Tokenizer, WorldModels, load_model
 from wm_nodes.world_model.folder import action_model_class
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.sentence_encoder import SentenceEncoder
-from wm_nodes.world_model.state_change import state_sizes
+from wm_nodes.world_model.state_model import state_sizes
 from wm_nodes.world_model.text import MAX_WORDS, task_instruction
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.training.decoder import train_decoder
-from wm_nodes.world_model.training.dynamics import LatentEpisodes, tokenise_episodes, train_action_model
+from wm_nodes.world_model.training.dynamics import train_action_model
+from wm_nodes.world_model.training.latent_episodes import LatentEpisodes, tokenise_episodes
 from wm_nodes.world_model.training.position_probe import train_position_probe
 from wm_nodes.world_model.training.state_probe import train_state_probe
 from wm_nodes.world_model.training.text import demonstrators, golden_rows, train_text_model

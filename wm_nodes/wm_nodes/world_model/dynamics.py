@@ -15,9 +15,9 @@ import torch
 from torch import Tensor, nn
 
 from wm_nodes.config.schema import WorldModelConfig
-from wm_nodes.core.differences import Differences
 from wm_nodes.world_model.conditions import ActionCondition
 from wm_nodes.world_model.state_change import StateChange
+from wm_nodes.world_model.state_model import StateModel
 from wm_nodes.world_model.tokenizer import NUM_POSITIONS, normalise_tokens
 from wm_nodes.world_model.transformer import RingCache, SpatioTemporalTransformer, TemporalCache
 
@@ -46,37 +46,38 @@ class DoneHeads(nn.Module):
 
     `num_positions` > 0: a head beside them reads positions off the same features, and the done heads see what it reads
     (without a gradient, so that it stays an estimate of positions). Success is a rule about positions.
-    `num_state` > 0: they see so many values of the frame's state as well.
+    `told`: a StateModel has the done heads; there are none here.
     """
 
     def __init__(
-        self, width: int, num_heads: int, num_tasks: int, num_positions: int = 0, num_state: int = 0
+        self, width: int, num_heads: int, num_tasks: int, num_positions: int = 0, *, told: bool = False
     ) -> None:
         super().__init__()
         self.num_heads, self.num_tasks, self.num_positions = num_heads, num_tasks, num_positions
-        inputs = 3 * width + num_positions + num_state
+        inputs = 3 * width + num_positions
         self.positions = (
             nn.Sequential(nn.Linear(3 * width, width), nn.SiLU(), nn.Linear(width, num_positions))
             if num_positions
             else None
         )
         self.heads = nn.ModuleList(
-            nn.Sequential(nn.Linear(inputs, width), nn.SiLU(), nn.Linear(width, num_tasks)) for _ in range(num_heads)
+            nn.Sequential(nn.Linear(inputs, width), nn.SiLU(), nn.Linear(width, num_tasks))
+            for _ in range(0 if told else num_heads)
         )
         for head in self.heads:
             nn.init.constant_(head[-1].bias, -2.0)  # type: ignore[index]
 
     def forward(
-        self, tokens_BTSD: Tensor, register_BTD: Tensor, state_BTN: Tensor | None = None
+        self, tokens_BTSD: Tensor, register_BTD: Tensor, told_BTKJ: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Done logits (B, T, K, J) and positions (B, T, num_positions), float32."""
+        """Done logits (B, T, K, J), where they are told these, and positions (B, T, num_positions), float32."""
         pooled = pooled_features(tokens_BTSD, register_BTD)
         positions = pooled[..., :0].float()
         if self.positions is not None:
             positions = self.positions(pooled).float()
             pooled = torch.cat((pooled, positions.detach().to(pooled.dtype)), -1)
-        if state_BTN is not None:
-            pooled = torch.cat((pooled, state_BTN.to(pooled.dtype)), -1)
+        if told_BTKJ is not None:
+            return told_BTKJ, positions
         return torch.stack([head(pooled) for head in self.heads], 2).float(), positions
 
 
@@ -110,7 +111,7 @@ class FrameModel(nn.Module):
 
     def __init__(
         self, config: WorldModelConfig, num_tokens: int, latent_dim: int, num_tasks: int, num_positions: int,
-        num_state: int = 0,
+        told: bool = False,
     ) -> None:
         super().__init__()
         self.condition_map: ConditionMap | None = None
@@ -123,15 +124,15 @@ class FrameModel(nn.Module):
         self.change = nn.Linear(width, latent_dim)
         nn.init.zeros_(self.change.weight)
         nn.init.zeros_(self.change.bias)
-        self.done = DoneHeads(width, config.num_done_heads, num_tasks, num_positions, num_state)
+        self.done = DoneHeads(width, config.num_done_heads, num_tasks, num_positions, told=told)
 
     def predict(
         self, latents_BTSD: Tensor, condition_BTND: Tensor, caches: Caches | None = None,
-        visible_BN: Tensor | None = None, state_BTN: Tensor | None = None,
+        visible_BN: Tensor | None = None, told_BTKJ: Tensor | None = None,
     ) -> Prediction:
         """Predict frame t + 1 for each of T given frames; later frames never influence earlier predictions.
 
-        visible_BN: False where a condition token is padding. state_BTN: what done heads see of the state at t + 1.
+        visible_BN: False where a condition token is padding. told_BTKJ: done logits of t + 1 that DoneHeads is told.
         """
         tokens = self.embed(latents_BTSD) + self.position
         if self.condition_map is not None:
@@ -139,42 +140,42 @@ class FrameModel(nn.Module):
         register = self.register.to(tokens.dtype).expand(*tokens.shape[:2], 1, -1)
         features = self.trunk(torch.cat((tokens, register), 2), condition_BTND, caches, visible_BN)
         tokens, register = features[:, :, :-1], features[:, :, -1]
-        logits, positions = self.done(tokens, register, state_BTN)
+        logits, positions = self.done(tokens, register, told_BTKJ)
         return Prediction(self.change(tokens).float(), positions, logits)
 
 
 class ActionModel(FrameModel):
-    """WM_act: the environment of the policy. state_change: None where the whole state is commanded. differences: those
-    of EnvironmentSpec; where there are any, the done heads see them and the state."""
+    """WM_act: the environment of the policy. What predicts the measured values of its state: state_model where
+    world_model.state_model_iterations says so, else state_change; both None where the whole state is commanded."""
 
     def __init__(
         self, config: WorldModelConfig, *, num_tokens: int, latent_dim: int, action_dim: int, state_dim: int,
         num_tasks: int, num_positions: int = NUM_POSITIONS, measured: tuple[int, ...] = (),
         differences: Sequence[tuple[int, int]] = (),
     ) -> None:
-        seen = Differences(state_dim, differences)
-        super().__init__(config, num_tokens, latent_dim, num_tasks, num_positions, seen.dim if differences else 0)
-        self.seen = seen if differences else None
+        told = config.state_model_iterations > 0
+        super().__init__(config, num_tokens, latent_dim, num_tasks, num_positions, told=told)
         self.condition = ActionCondition(action_dim, state_dim, config.width)
         if config.condition_map:
             self.condition_map = ConditionMap(config.width, config.condition_map, num_tokens)
-        self.state_change = (
-            StateChange(action_dim, state_dim, latent_dim, measured, differences) if measured else None
-        )
+        self.state_change: StateChange | None = None
+        self.state_model: StateModel | None = None
+        if told:
+            self.state_model = StateModel(state_dim, measured, differences, num_tasks, config.num_done_heads)
+        elif measured:
+            self.state_change = StateChange(action_dim, state_dim, latent_dim, measured)
 
     def forward(
         self, latents_BTSD: Tensor, actions_BTA: Tensor, states_BTP: Tensor, next_states_BTP: Tensor,
         caches: Caches | None = None,
     ) -> Prediction:
         condition = self.condition(actions_BTA, states_BTP, next_states_BTP)
-        return self.predict(latents_BTSD, condition, caches, state_BTN=self.done_state(next_states_BTP))
+        return self.predict(latents_BTSD, condition, caches, told_BTKJ=self.told(next_states_BTP))
 
-    def done_state(self, states_BTP: Tensor) -> Tensor | None:
-        """What the done heads see of the states of their frames; None: nothing."""
-        if self.seen is None:
-            return None
-        seen: Tensor = self.seen((states_BTP - self.condition.state_mean) / self.condition.state_scale, states_BTP)
-        return seen
+    @torch.no_grad()
+    def told(self, states_BTP: Tensor) -> Tensor | None:
+        """Done logits of the states; None: the done heads read them off the picture."""
+        return None if self.state_model is None else self.state_model.done_logits(states_BTP)
 
     def advance(
         self, latents_NSD: Tensor, actions_NA: Tensor, states_NP: Tensor, next_states_NP: Tensor,

@@ -25,7 +25,7 @@ from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.positions import num_positions_of
 from wm_nodes.world_model.sentence_encoder import SentenceCondition
-from wm_nodes.world_model.state_change import state_sizes
+from wm_nodes.world_model.state_model import state_sizes
 from wm_nodes.world_model.text import TextModel
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer

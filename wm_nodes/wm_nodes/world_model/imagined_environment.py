@@ -27,6 +27,7 @@ from wm_nodes.world_model.imagined_episodes import (
 )
 from wm_nodes.world_model.parts import in_parallel, parts_of
 from wm_nodes.world_model.precision import copy_in_bfloat16, has_fast_bfloat16
+from wm_nodes.world_model.state_model import next_states
 from wm_nodes.world_model.text import ImaginedGoals, imagine_goals
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.transformer import RingCache, SpatioTemporalTransformer
@@ -93,6 +94,10 @@ class DeviceEnvironment(DeviceEpisodes):
             difference as disagreement.
         fixed: see RingTimes; by default on all devices but the CPU.
 
+    Attributes:
+        pictures: False leaves the frames those of the start. Nothing else differs where every model has a state_model;
+            elsewhere it may not be set.
+
     Raises:
         ValueError: a second model with another tokenizer, or with other tasks.
     """
@@ -102,7 +107,7 @@ class DeviceEnvironment(DeviceEpisodes):
         *, num_envs: int, instructions: Sequence[str] = (), with_goals: bool = True, exact: bool = False,
         second: WorldModels | None = None, fixed: bool | None = None,
     ) -> None:
-        device = models.tokenizer.device
+        device, self.pictures = models.tokenizer.device, True
         super().__init__(imagined_spec(spec, f"wm/{spec.task}", models.sha256, num_envs), starts, reward, device)
         if second and (second.tokenizer_sha256, second.tasks) != (models.tokenizer_sha256, models.tasks):
             raise ValueError(
@@ -130,6 +135,7 @@ class DeviceEnvironment(DeviceEpisodes):
     def begin_anew(self) -> None:
         super().begin_anew()
         num_envs = self.spec.num_envs
+        self._earlier_NP = self.states_NP[:, : self.spec.tool_dim].clone()
         self.imagined = [
             ImaginedLatents(
                 model, self._start_latents[:1].repeat(num_envs, 1, 1),
@@ -167,40 +173,64 @@ class DeviceEnvironment(DeviceEpisodes):
             )
             return self._tokenizer.flatten(latents, inputs)
 
+    @property
+    def is_told(self) -> bool:
+        """Whether states alone say what happens, see pictures."""
+        return all(model.state_model is not None for model in self._models)
+
     def _begin(self, begins_N: Tensor) -> None:
+        put_where(begins_N, self._earlier_NP, self._start_states[self.starts_N, : self.spec.tool_dim])
         for imagined in self.imagined:
             put_where(begins_N, imagined.latents_NSD, self._start_latents[self.starts_N])
             for rows, caches in imagined.parts:
                 caches[0].restart(begins_N[rows])
 
     def _move(self, actions_NA: Tensor) -> Tensor:
-        moved, change, tool = super()._move(actions_NA), self._models[0].state_change, self.spec.tool_dim
-        if change is None:
+        moved, tool = super()._move(actions_NA), self.spec.tool_dim
+        if not self.spec.measured:
             return moved
+        now, latents = self.states_NP[:, :tool].contiguous(), self.imagined[0].latents_NSD
         with self._autocast(exact=self._exact):
-            predicted = change.next_states(
-                self.imagined[0].latents_NSD, actions_NA, self.states_NP[:, :tool], moved[:, :tool]
-            )
-        return torch.cat([predicted, moved[:, tool:]], 1)
+            found = next_states(self._models[0], latents, actions_NA, now, self._earlier_NP, moved[:, :tool])
+        put_where(~self._ended_N, self._earlier_NP, now)
+        return torch.cat([found, moved[:, tool:]], 1)
 
     def _predict(
         self, actions_NA: Tensor, moved_NP: Tensor, valid_N: Tensor, noise: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """noise: (N, S, D), on the latents of the shown frames; the model goes on without it."""
         tasks = self._start_tasks[self.starts_N]
+        if not self.pictures:
+            return self.frames_NHWC, *self._agreed([self._told(model, moved_NP) for model in self._models], tasks)
 
         def show(latents: Tensor, rows: slice) -> Tensor:
             with self._autocast():
                 return self._tokenizer.decode_part(latents if noise is None else latents + noise[rows])
 
         logits, frames = self._advance(self.imagined[0], actions_NA, moved_NP, valid_N, show)
-        signal, spread = task_done_signal(logits, tasks)
-        for rival in self.imagined[1:]:
-            logits, _ = self._advance(rival, actions_NA, moved_NP, valid_N, lambda latents, rows: latents[:0])
-            other, other_spread = task_done_signal(logits, tasks)
+        others = [
+            self._advance(rival, actions_NA, moved_NP, valid_N, lambda latents, rows: latents[:0])[0]
+            for rival in self.imagined[1:]
+        ]
+        return frames, *self._agreed([logits, *others], tasks)
+
+    def _told(self, model: ActionModel | TokenActionModel, moved_NP: Tensor) -> Tensor:
+        """Done logits (N, K, J) by the states alone."""
+        assert model.state_model is not None  # see pictures
+        after = moved_NP[:, : self.spec.tool_dim]
+        self.finite.logical_and_(torch.isfinite(after).all())
+        logits: Tensor = model.state_model.done_logits(after)
+        return logits
+
+    @staticmethod
+    def _agreed(logits: Sequence[Tensor], tasks_N: Tensor) -> tuple[Tensor, Tensor]:
+        """The done signal (N,) that all models agree on, and how far they and their heads differ (N,)."""
+        signal, spread = task_done_signal(logits[0], tasks_N)
+        for rival in logits[1:]:
+            other, other_spread = task_done_signal(rival, tasks_N)
             spread = torch.stack([spread, other_spread, (signal - other).abs()]).amax(0)
             signal = torch.minimum(signal, other)
-        return frames, signal, spread
+        return signal, spread
 
     def _advance(
         self, imagined: ImaginedLatents, actions_NA: Tensor, moved_NP: Tensor, valid_N: Tensor,

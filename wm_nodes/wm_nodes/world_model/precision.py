@@ -41,13 +41,14 @@ def compute_context(device: torch.device, *, exact: bool = False) -> AbstractCon
 
 
 def copy_in_bfloat16(model: _Model) -> _Model:
-    """A copy whose products have their weights in bfloat16; the rest stays float32.
+    """A copy whose products have their weights in bfloat16; the rest, and parts that are `exact`, stay float32.
 
     Under autocast it computes what the model does, bit for bit, without casting the same weights at every call, which
     autocast does to weights without gradients.
     """
     copied = deepcopy(model)
+    exact = {part for module in copied.modules() if getattr(module, "exact", False) for part in module.modules()}
     for module in copied.modules():
-        if isinstance(module, (nn.Linear, nn.Conv2d)):
+        if isinstance(module, (nn.Linear, nn.Conv2d)) and module not in exact:
             module.to(torch.bfloat16)
     return copied

@@ -1,21 +1,10 @@
-"""How the measured values of a state change, where no rule says it (RS-1f).
+"""How the measured values of a state change, where no rule says it but the picture does.
 
 Shapes: ... any batch, S tokens, D values per token, A action, P state, M measured values.
 """
 
-from collections.abc import Sequence
-from typing import Any
-
 import torch
 from torch import Tensor, nn
-
-from wm_nodes.core.differences import Differences
-from wm_nodes.core.specs import EnvironmentSpec
-
-
-def state_sizes(spec: EnvironmentSpec) -> dict[str, Any]:
-    """What an action model is told of a spec's state, beside its size."""
-    return {"measured": spec.measured, "differences": spec.differences}
 
 
 class StateChange(nn.Module):
@@ -23,25 +12,16 @@ class StateChange(nn.Module):
 
     Args:
         measured: which values of a state, see EnvironmentSpec.measured.
-        differences: EnvironmentSpec.differences, where things touch each other; then it is a larger network.
     """
 
-    HIDDEN, HIDDEN_OF_CONTACTS = 64, 256
-    DELTA_OF_CONTACTS = 0.1
-    """Of the Huber loss, in units of change_scale: most steps move nothing, and a squared error would let all drift."""
+    HIDDEN = 64
 
-    def __init__(
-        self, action_dim: int, state_dim: int, latent_dim: int, measured: tuple[int, ...],
-        differences: Sequence[tuple[int, int]] = (),
-    ) -> None:
+    def __init__(self, action_dim: int, state_dim: int, latent_dim: int, measured: tuple[int, ...]) -> None:
         super().__init__()
-        self.measured, self.differences = measured, Differences(state_dim, differences)
-        self.delta = self.DELTA_OF_CONTACTS if differences else 1.0
-        hidden = self.HIDDEN_OF_CONTACTS if differences else self.HIDDEN
-        further = [nn.Linear(hidden, hidden), nn.SiLU()] if differences else []
+        self.measured = measured
         self.read = nn.Sequential(
-            nn.Linear(action_dim + self.differences.dim + latent_dim, hidden), nn.SiLU(),
-            nn.Linear(hidden, hidden), nn.SiLU(), *further, nn.Linear(hidden, len(measured)),
+            nn.Linear(action_dim + state_dim + latent_dim, self.HIDDEN), nn.SiLU(),
+            nn.Linear(self.HIDDEN, self.HIDDEN), nn.SiLU(), nn.Linear(self.HIDDEN, len(measured)),
         )
         self.state_mean: Tensor
         self.state_scale: Tensor
@@ -61,7 +41,7 @@ class StateChange(nn.Module):
 
     def forward(self, latents_SD: Tensor, actions_A: Tensor, states_P: Tensor) -> Tensor:
         """Change (..., M) in units of change_scale; latents (..., S, D), actions (..., A), states (..., P)."""
-        scaled = self.differences((states_P - self.state_mean) / self.state_scale, states_P)
+        scaled = (states_P - self.state_mean) / self.state_scale
         change: Tensor = self.read(torch.cat((actions_A, scaled, latents_SD.float().mean(-2)), -1))
         return change.float()
 

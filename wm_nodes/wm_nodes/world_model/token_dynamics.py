@@ -40,6 +40,8 @@ class TokenActionModel(nn.Module):
         differences: Sequence[tuple[int, int]] = (),
     ) -> None:
         super().__init__()
+        if config.state_model_iterations:
+            raise ValueError("world_model.state_model_iterations goes with tokenizer.kind continuous alone; set it 0")
         width = config.width
         self.num_tokens, self.latent_dim, self.num_passes = num_tokens, latent_dim, config.decoding_steps
         self.embed = nn.Linear(latent_dim, width)
@@ -52,9 +54,8 @@ class TokenActionModel(nn.Module):
         self.copy_bias = nn.Parameter(torch.full((len(self.heads),), 2.0))
         self.done = DoneHeads(width, config.num_done_heads, num_tasks)
         self.condition = ActionCondition(action_dim, state_dim, width)
-        self.state_change = (
-            StateChange(action_dim, state_dim, latent_dim, measured, differences) if measured else None
-        )
+        self.state_change = StateChange(action_dim, state_dim, latent_dim, measured) if measured else None
+        self.state_model = None
 
     def forward(
         self, bits_BTSD: Tensor, next_bits_BTSD: Tensor, decided_BTS: Tensor, condition_BTND: Tensor,

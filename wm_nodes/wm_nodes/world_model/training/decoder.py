@@ -16,7 +16,8 @@ from wm_nodes.training.background import BackgroundBatches
 from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
-from wm_nodes.world_model.training.dynamics import ENCODING_BATCH, HUBER_DELTA, LatentEpisodes, unroll
+from wm_nodes.world_model.training.dynamics import HUBER_DELTA, unroll
+from wm_nodes.world_model.training.latent_episodes import ENCODING_BATCH, LatentEpisodes
 from wm_nodes.world_model.training.tokenizer import LATENT_NOISE, foreground_weight
 
 BATCH = 32

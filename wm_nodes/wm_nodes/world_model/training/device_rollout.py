@@ -31,7 +31,7 @@ MOST_ROWS = 65535
 
 def roll_out_on_device(
     model: FrameModel, tokenizer: Tokenizer, real_BTSL: Tensor, anchors_BT: Tensor, condition_BTND: Tensor,
-    dtype: torch.dtype, visible_BN: Tensor | None = None, state_BTN: Tensor | None = None,
+    dtype: torch.dtype, visible_BN: Tensor | None = None, told_BTKJ: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return next_latents, positions and done_logits of frames 1..T, as training.dynamics.RolloutTerms.
 
@@ -39,7 +39,7 @@ def roll_out_on_device(
         real_BTSL: normalised latents of the recorded frames.
         anchors_BT: True where the model goes on from the recorded frame; the first frame always is one.
         visible_BN: False where a condition token is padding; None where none is.
-        state_BTN: what done heads see of the states of frames 1..T.
+        told_BTKJ: what DoneHeads is told of frames 1..T.
     """
     batch, steps = condition_BTND.shape[:2]
     given = F.pad(real_BTSL, (0, 0, 0, 1))  # the register's row; the model adds its own value to these zeros
@@ -57,7 +57,7 @@ def roll_out_on_device(
         normal_BTSD = torch.stack(features, 1)
         norm = model.trunk.norm
         features_BTSD = normal_BTSD * norm.weight + norm.bias
-    logits, positions = model.done(features_BTSD[:, :, :-1], features_BTSD[:, :, -1], state_BTN)
+    logits, positions = model.done(features_BTSD[:, :, :-1], features_BTSD[:, :, -1], told_BTKJ)
     return torch.stack(frames, 1)[:, :, :-1], positions, logits
 
 

@@ -23,11 +23,15 @@ from wm_nodes.training.background import BackgroundBatches
 from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.dynamics import ActionModel, FrameModel, Prediction
 from wm_nodes.world_model.precision import compute_context, has_fast_bfloat16
-from wm_nodes.world_model.state_change import StateChange, state_sizes
+from wm_nodes.world_model.state_change import StateChange
+from wm_nodes.world_model.state_model import state_sizes
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.device_rollout import roll_out_on_device
-from wm_nodes.world_model.training.tokenizer import foreground_weight, probe_loss, probed_targets
+from wm_nodes.world_model.training.done import bootstrap_masks, done_losses, done_mask
+from wm_nodes.world_model.training.latent_episodes import LatentEpisodes, first_frames, tokenise_episodes, tool_moves
+from wm_nodes.world_model.training.state_model import train_state_model
+from wm_nodes.world_model.training.tokenizer import foreground_weight, probe_loss
 
 M = TypeVar("M", ActionModel, TokenActionModel)
 
@@ -35,50 +39,8 @@ INPUT_NOISE = 0.05
 """Standard deviation of noise on real input frames, against copying tokenizer detail."""
 HUBER_DELTA = 0.5
 MAX_TOKEN_WEIGHT = 4.0
-MOVING_SHARE, MOVED = 0.75, 0.005
-"""See first_frames. A tool has moved whose commanded state has changed by more than MOVED (m, rad, or gripper)."""
-BOOTSTRAP_SHARE = 0.7
-"""Each done head learns from its own random share of the episodes, so that heads disagree where data are thin."""
-ENCODING_BATCH = 256
 DECODED_FRAMES = 2
 """Predicted frames of each episode that are decoded and encoded again in an iteration (decoded_losses)."""
-
-
-@dataclass(frozen=True)
-class LatentEpisodes:
-    """Tokenised episodes."""
-
-    images: Tensor
-    """(E, T + 1, H, W, 3), as in EpisodeArrays."""
-    latents: Tensor
-    """float16 (E, T + 1, S, D)."""
-    mean_change_S: Tensor
-    """float32 (S,), mean absolute change of each token since the first frame."""
-    states: Tensor
-    """(E, T + 1, S), as in EpisodeArrays."""
-    actions: Tensor
-    """(E, T, A), as in EpisodeArrays."""
-    success: Tensor
-    """(E, T + 1, J), as in EpisodeArrays."""
-    labelled: Tensor
-    """(E, J), as in EpisodeArrays."""
-    truth: Tensor
-    """float32 (E, T + 1, P), m."""
-    step_mask: Tensor
-    """(E, T), as in EpisodeArrays."""
-
-    def __len__(self) -> int:
-        return len(self.latents)
-
-    def parts(self, index: Tensor, first: Tensor, steps: int) -> "LatentEpisodes":
-        """`steps` steps of each of the episodes `index` (B,), from frame `first` (B,); without images, all on one
-        device."""
-        rows, frames = index[:, None], first[:, None] + torch.arange(steps + 1, device=first.device)
-        return LatentEpisodes(
-            self.images[:0], self.latents[rows, frames], self.mean_change_S, self.states[rows, frames],
-            self.actions[rows, frames[:, :-1]], self.success[rows, frames], self.labelled[index],
-            self.truth[rows, frames], self.step_mask[rows, frames[:, :-1]],
-        )
 
 
 @dataclass(frozen=True)
@@ -93,23 +55,6 @@ class RolloutTerms:
     """(B, T, K, J)."""
 
 
-def tokenise_episodes(tokenizer: Tokenizer, episodes: EpisodeArrays) -> LatentEpisodes:
-    """Encode every frame once; all but the images, a thousand times the rest, then lie on the tokenizer's device."""
-    device = tokenizer.device
-    flat = episodes.images.reshape(-1, *episodes.images.shape[2:])
-    pieces = [tokenizer.encode(flat[i : i + ENCODING_BATCH]).half() for i in range(0, len(flat), ENCODING_BATCH)]
-    latents = torch.cat(pieces).clone().reshape(*episodes.images.shape[:2], *pieces[0].shape[1:])
-    change = (latents[:, 1:].float() - latents[:, :1].float()).abs().mean(-1).mean((0, 1))
-    return LatentEpisodes(
-        images=torch.from_numpy(episodes.images), latents=latents, mean_change_S=change,
-        states=torch.from_numpy(episodes.states).to(device), actions=torch.from_numpy(episodes.actions).to(device),
-        success=torch.from_numpy(episodes.success).to(device),
-        truth=torch.from_numpy(probed_targets(episodes, states=tokenizer.num_positions > 0)).to(device),
-        labelled=torch.from_numpy(episodes.labelled).to(device),
-        step_mask=torch.from_numpy(episodes.step_mask).to(device),
-    )
-
-
 def train_action_model(
     tokenizer: Tokenizer, episodes: EpisodeArrays | LatentEpisodes, config: RunConfig, seed: int, run_dir: Path | None,
     *, model: ActionModel | None = None, done_loss: str = "bce", spec: EnvironmentSpec | None = None,
@@ -120,7 +65,7 @@ def train_action_model(
     positions (those the model says, and those the tokenizer's frozen probe reads off the predicted latents) +
     world_model.decoded_weight * decoded_losses, without recoded_state where state_weight is 0. `model` continues from
     given weights (online rounds). spec: as new_model's; the loss of its measured values is state_change_loss, with
-    weight 1.
+    weight 1. A state_model is trained before, alone (train_state_model), and then stays as it is.
     """
     data = episodes if isinstance(episodes, LatentEpisodes) else tokenise_episodes(tokenizer, episodes)
     settings = config.world_model
@@ -128,6 +73,8 @@ def train_action_model(
         model = new_model(ActionModel, "action_model_init", tokenizer, data, settings, seed, spec)
     tokenizer.requires_grad_(False)
     trained = model
+    if trained.state_model is not None:
+        train_state_model(trained.state_model, data, settings.state_model_iterations, seed, run_dir)
     heads = bootstrap_masks(len(data), settings.num_done_heads, seed).to(tokenizer.device)
     lengths, moves = data.step_mask.sum(1).cpu(), tool_moves(data).cpu()
     whole = data.actions.shape[1]
@@ -190,9 +137,10 @@ def new_model(
             num_positions=data.truth.shape[-1], **(state_sizes(spec) if spec else {}),
         )
     model.condition.fit_states(data.states.flatten(0, 1))
-    if model.state_change is not None:
-        before, after = data.states[:, :-1][data.step_mask], data.states[:, 1:][data.step_mask]
-        model.state_change.fit_scale(before, after - before)
+    for change in (model.state_change, model.state_model):
+        if change is not None:
+            before, after = data.states[:, :-1][data.step_mask], data.states[:, 1:][data.step_mask]
+            change.fit_scale(before, after - before)
     return model.to(tokenizer.device)
 
 
@@ -200,34 +148,13 @@ def state_change_loss(change: StateChange, part: LatentEpisodes) -> Tensor:
     """Mean Huber loss of the predicted changes of the measured values, from recorded frames and states."""
     states, steps = part.states, part.step_mask.float().unsqueeze(-1)
     found = change(part.latents[:, :-1], part.actions, states[:, :-1])
-    wanted = change.wanted(states[:, :-1], states[:, 1:])
-    errors = F.huber_loss(found, wanted, reduction="none", delta=change.delta) / change.delta
+    errors = F.huber_loss(found, change.wanted(states[:, :-1], states[:, 1:]), reduction="none")
     return (errors * steps).sum() / (steps.sum() * errors.shape[-1]).clamp_min(1)
 
 
 def rollout_steps_at(iteration: int, num_iterations: int, stages: list[int]) -> int:
     """Imagined steps between real frames at this iteration: the stages in equal shares of the training."""
     return stages[min(len(stages) - 1, iteration * len(stages) // max(1, num_iterations))]
-
-
-def tool_moves(data: LatentEpisodes) -> Tensor:
-    """Bool (E, T), the recorded steps that change the state; all of an episode that has none."""
-    moves = ((data.states[:, 1:] - data.states[:, :-1]).abs() > MOVED).any(-1) & data.step_mask
-    return torch.where(moves.any(1, keepdim=True), moves, data.step_mask)
-
-
-def first_frames(lengths: Tensor, moves: Tensor, num_steps: int, generator: torch.Generator) -> Tensor:
-    """(B,), a random frame of each of B episodes of `lengths` steps from which num_steps more were recorded; 0 where
-    there is none. moves: tool_moves of the episodes (B, T).
-
-    MOVING_SHARE of the parts hold a random step of which the tool moves: an episode that has succeeded long before its
-    end stands still for most of its time.
-    """
-    last = (lengths - num_steps).clamp(min=0)
-    share, anywhere, before = torch.rand(3, len(lengths), generator=generator)
-    step = torch.multinomial(moves.float(), 1, generator=generator)[:, 0]
-    around = (step - (before * num_steps).long()).clamp(min=0)
-    return torch.where(share < MOVING_SHARE, torch.minimum(around, last), (anywhere * (last + 1)).long())
 
 
 def starts(
@@ -252,18 +179,18 @@ def unroll(
     real = data.latents[index].float()
     states, actions = data.states[index], data.actions[index]
     noisy = tokenizer.normalise(real[:, :-1] + INPUT_NOISE * noise)
-    condition, seen = model.condition(actions, states[:, :-1], states[:, 1:]), model.done_state(states[:, 1:])
+    condition, told = model.condition(actions, states[:, :-1], states[:, 1:]), model.told(states[:, 1:])
     if one_pass:
-        prediction = model.predict(noisy, condition, state_BTN=seen)
+        prediction = model.predict(noisy, condition, told_BTKJ=told)
         one_step = tokenizer.normalise(noisy + prediction.change_BTSD)
         return RolloutTerms(one_step, prediction.positions_BTQ, prediction.done_logits_BTKJ)
     if wants_few_kernels(noisy.device):
-        return roll_out_for_device(model, tokenizer, noisy, anchors, condition, state=seen)
+        return roll_out_for_device(model, tokenizer, noisy, anchors, condition, told=told)
     caches = model.trunk.new_caches()
 
     def predict(t: int, latents: Tensor) -> Prediction:
-        now = None if seen is None else seen[:, t : t + 1]
-        return model.predict(latents, condition[:, t : t + 1], caches, state_BTN=now)
+        now = None if told is None else told[:, t : t + 1]
+        return model.predict(latents, condition[:, t : t + 1], caches, told_BTKJ=now)
 
     def choose_input(t: int, frame: Tensor) -> Tensor:
         return torch.where(anchors[:, t, None, None, None], noisy[:, t : t + 1], frame)
@@ -299,11 +226,11 @@ def wants_few_kernels(device: torch.device) -> bool:
 
 def roll_out_for_device(
     model: FrameModel, tokenizer: Tokenizer, real: Tensor, anchors: Tensor, condition: Tensor,
-    visible: Tensor | None = None, state: Tensor | None = None,
+    visible: Tensor | None = None, told: Tensor | None = None,
 ) -> RolloutTerms:
     """roll_out in few kernels: the same numbers to rounding. See device_rollout for the arguments."""
     dtype = torch.bfloat16 if has_fast_bfloat16(real.device) else torch.float32
-    return RolloutTerms(*roll_out_on_device(model, tokenizer, real, anchors, condition, dtype, visible, state))
+    return RolloutTerms(*roll_out_on_device(model, tokenizer, real, anchors, condition, dtype, visible, told))
 
 
 def rollout_losses(
@@ -374,27 +301,3 @@ def token_weights(latents_BTSD: Tensor, mean_change_S: Tensor) -> Tensor:
     frame, more than it does on average."""
     change = (latents_BTSD[:, 1:] - latents_BTSD[:, :1]).abs().mean(-1)
     return 0.5 + 0.5 * (change / mean_change_S.clamp_min(1e-3)).clamp(max=2 * MAX_TOKEN_WEIGHT)
-
-
-def done_mask(data: LatentEpisodes, index: Tensor, mask_BT: Tensor, head_mask_BK: Tensor) -> Tensor:
-    """(B, T, K, J): 1 where head k learns task j's label of a frame of the episodes `index`; see rollout_losses."""
-    return mask_BT[:, :, None, None] * head_mask_BK[:, None, :, None] * data.labelled[index][:, None, None]
-
-
-def done_losses(logits_BTKJ: Tensor, labels_BTJ: Tensor, mask_BTKJ: Tensor, kind: str = "bce") -> Tensor:
-    """kind "rmse": RS-3, the root of the mean squared error; "bce": binary cross-entropy on the same labels."""
-    labels, weight = labels_BTJ.unsqueeze(2).expand_as(logits_BTKJ), mask_BTKJ.expand_as(logits_BTKJ)
-    if kind == "rmse":
-        squared = (logits_BTKJ.sigmoid() - labels).square()
-        return ((squared * weight).sum() / weight.sum().clamp_min(1) + 1e-8).sqrt()
-    if kind != "bce":
-        raise ValueError(f"done_loss must be 'bce' or 'rmse', got {kind!r}")
-    entropy = F.binary_cross_entropy_with_logits(logits_BTKJ, labels, reduction="none")
-    return (entropy * weight).sum() / weight.sum().clamp_min(1)
-
-
-def bootstrap_masks(num_episodes: int, num_heads: int, seed: int) -> Tensor:
-    """Float (E, K), 1 where head k learns from episode e; with one head every episode counts."""
-    if num_heads == 1:
-        return torch.ones(num_episodes, 1)
-    return (torch.rand(num_episodes, num_heads, generator=torch_stream(seed, "bootstrap")) < BOOTSTRAP_SHARE).float()

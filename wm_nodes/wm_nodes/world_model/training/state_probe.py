@@ -10,7 +10,7 @@ from wm_nodes.config.schema import TokenizerConfig
 from wm_nodes.core.seeding import numpy_stream, torch_stream
 from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.tokenizer import Tokenizer
-from wm_nodes.world_model.training.dynamics import LatentEpisodes
+from wm_nodes.world_model.training.latent_episodes import LatentEpisodes
 from wm_nodes.world_model.training.tokenizer import LATENT_NOISE, probe_loss
 
 BATCH = 256

@@ -18,13 +18,13 @@ from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.text import TextModel, instruction_for, vocabulary_of
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.dynamics import (
-    LatentEpisodes,
     RolloutTerms,
     roll_out,
     roll_out_for_device,
     rollout_losses,
     wants_few_kernels,
 )
+from wm_nodes.world_model.training.latent_episodes import LatentEpisodes
 
 STEPS_AFTER_SUCCESS = 2
 
@@ -53,8 +53,7 @@ def train_text_model(
             num_positions=tokenizer.num_positions,
         )
     model.condition(row_instructions(episodes, rows, instructions))  # raises before a long training, not in it
-    own = ("condition.", "done.heads.") if action_model.seen else ("condition.",)  # heads that see a state differ
-    shared = {name: t for name, t in action_model.state_dict().items() if not name.startswith(own)}
+    shared = {name: t for name, t in action_model.state_dict().items() if not name.startswith("condition.")}
     model.load_state_dict(shared, strict=False)
     model.to(tokenizer.device)
     tokenizer.requires_grad_(False)

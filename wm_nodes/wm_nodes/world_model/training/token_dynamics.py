@@ -16,14 +16,9 @@ from wm_nodes.world_model.decoding import choose_codes, code_targets
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
-from wm_nodes.world_model.training.dynamics import (
-    LatentEpisodes,
-    bootstrap_masks,
-    done_losses,
-    done_mask,
-    new_model,
-    state_change_loss,
-)
+from wm_nodes.world_model.training.done import bootstrap_masks, done_losses, done_mask
+from wm_nodes.world_model.training.dynamics import new_model, state_change_loss
+from wm_nodes.world_model.training.latent_episodes import LatentEpisodes
 
 MAX_CORRUPTION = 0.2
 """Share of the tokens of the last given frame that are replaced by random codes; it grows linearly with time, so that

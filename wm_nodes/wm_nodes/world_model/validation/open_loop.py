@@ -26,6 +26,7 @@ from wm_nodes.world_model.dynamics import ActionModel, done_signal
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.positions import columns_of
 from wm_nodes.world_model.precision import compute_context
+from wm_nodes.world_model.state_model import next_states
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.tokenizer import episode_targets
@@ -75,14 +76,13 @@ def imagine(
     actions_ETA, states_ETS = (torch.from_numpy(array).to(current.device) for array in (actions, states))
     caches = model.trunk.new_ring_caches(len(images), current.device)
     frames, signals, spreads = list[Tensor](), list[Tensor](), list[Tensor]()
-    before = states_ETS[:, 0]
+    earlier = before = states_ETS[:, 0]
     for t in range(actions.shape[1]):
         acted, after = actions_ETA[:, t], states_ETS[:, t + 1]
         with compute_context(current.device):
-            if model.state_change is not None:
-                after = model.state_change.next_states(current, acted, before, after)
+            after = next_states(model, current, acted, before, earlier, after)
             current, logits = model.advance(current, acted, before, after, caches)
-        before = after
+        earlier, before = before, after
         signal, spread = done_signal(logits)
         frames.append(tokenizer.decode(current))
         signals.append(signal)
