@@ -1,15 +1,16 @@
 """The benchmark's own parts: what it counts and how it alternates."""
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 
 from benchmarks.speed import speed
-from benchmarks.speed.inputs import actions_of, interleave, seeds_of
+from benchmarks.speed.inputs import actions_of, interleave, prepare_model, random_model, seeds_of
 from benchmarks.speed.noop_environment import make_noop_environment
-from benchmarks.speed.simulator import rate_episode
+from benchmarks.speed.simulator import imagined_contender, rate_episode
 from benchmarks.speed.stages import fresh_pictures
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
@@ -41,6 +42,21 @@ def test_the_costless_environment_never_ends_so_that_every_step_counts() -> None
     for actions in actions_of(env.spec, 0, 3 * env.spec.max_episode_steps):
         assert env.step(actions).valid.all()
     assert rate_episode(env, RuleReward(), 1) > 0
+
+
+def test_a_model_of_states_is_measured_as_rl_uses_it(tmp_path: Path) -> None:
+    config = load_config("smoke", {
+        "task": "push", "simulation.object_state": "truth", "policy.inputs": "state",
+        "world_model.state_model_iterations": 1, "reward.success_threshold": 1.0,
+    })
+    folder = random_model(config, tmp_path / "model")
+    model, starts, _ = prepare_model(config, tmp_path, folder)
+    rates = []
+    for inputs in ("state", "latents"):
+        its = config.with_values(policy=config.policy.with_values(inputs=inputs))
+        contender = imagined_contender(its, model, starts)
+        rates.append(max(contender(block) for block in range(3)))
+    assert rates[0] > rates[1] > 0
 
 
 def test_a_simulator_that_was_not_measured_is_shown_with_the_reason_and_no_number(

@@ -10,6 +10,7 @@ import torch
 from wm_nodes.config.load import load_config
 from wm_nodes.config.object_state import READER
 from wm_nodes.core.device import DeviceError
+from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.environments import collection
 from wm_nodes.environments.collection import SCATTERED
 from wm_nodes.environments.object_reader import load_object_reader
@@ -18,6 +19,7 @@ from wm_nodes.policy_rl import pretraining
 from wm_nodes.policy_rl.pretraining import _make_tokenizer_folder, make_model
 from wm_nodes.recording import read_episodes
 from wm_nodes.world_model import Tokenizer, load_model_folder, load_starts
+from wm_nodes.world_model.folder import save_refreshed_folder
 
 
 def test_the_untrained_model_beside_a_tokenizer_is_that_of_the_seed(tmp_path: Path) -> None:
@@ -86,6 +88,11 @@ def test_one_model_is_made_of_the_episodes_of_several_tasks_and_measured_on_ever
     reader = load_object_reader(folder / READER, models.spec)
     assert reader.views == 2 and story["training"]["object_reader"]["error_m"] > 0
     assert models.spec.measured and models.action.state_model is not None
+    refreshed = save_refreshed_folder(tmp_path / "refreshed", folder, models.action, {})
+    assert (refreshed / READER).read_bytes() == (folder / READER).read_bytes()
+    (refreshed / READER).write_bytes(b"")
+    with pytest.raises(ModelFolderError, match="is not the file its manifest names"):
+        load_model_folder(refreshed)
     for split in ("heldout", "heldout_ood_object", "heldout_ood_combo"):
         assert {task: values["episodes"] for task, values in story[split].items()} == dict.fromkeys(models.tasks, 1)
         assert "done_push_auc" in story[split]["push"] and "done_pull_auc" not in story[split]["push"]

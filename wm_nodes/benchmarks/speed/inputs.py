@@ -25,6 +25,7 @@ from wm_nodes.environments.registry import configured_spec
 from wm_nodes.policy_rl.factories import models_of
 from wm_nodes.world_model import load_starts, save_model_folder
 from wm_nodes.world_model.dynamics import ActionModel
+from wm_nodes.world_model.state_model import state_sizes
 from wm_nodes.world_model.text import TextModel, vocabulary_of
 from wm_nodes.world_model.tokenizer import Tokenizer
 
@@ -67,7 +68,8 @@ def prepare_model(config: RunConfig, folder: Path, given: Path | None) -> tuple[
         size = config.simulation.image_size
         images = rng.integers(0, 256, (NUM_STARTS, size, size * len(config.simulation.cameras), 3), np.uint8)
         low, high = config.simulation.workspace_low_m, config.simulation.workspace_high_m
-        states = rng.uniform(low, high, (NUM_STARTS, 3)).astype(np.float32)
+        states = np.zeros((NUM_STARTS, configured_spec(config).state_dim), np.float32)
+        states[:, :3] = rng.uniform(low, high, (NUM_STARTS, 3))
     save_file({"images": torch.from_numpy(images.copy()), "states": torch.from_numpy(states.copy())}, starts_file)
     models = models_of(model_dir)
     millions = sum(p.numel() for m in (models.tokenizer, models.action) for p in m.parameters()) / 1e6
@@ -84,11 +86,14 @@ def random_model(config: RunConfig, folder: Path) -> Path:
     sizes: dict[str, Any] = {
         "num_tokens": tokenizer.num_tokens, "latent_dim": tokenizer.latent_dim, "num_tasks": len(tasks),
     }
-    action = ActionModel(config.world_model, action_dim=3, state_dim=3, **sizes)
+    spec = configured_spec(config)
+    action = ActionModel(
+        config.world_model, action_dim=spec.action_dim, state_dim=spec.state_dim, **sizes, **state_sizes(spec)
+    )
     words = vocabulary_of(tuple(get_task(task).instruction for task in tasks))
     text = TextModel(config.world_model, vocabulary=words, **sizes)
     return save_model_folder(
-        folder, tokenizer, action, text, config, spec=configured_spec(config), tasks=tasks,
+        folder, tokenizer, action, text, config, spec=spec, tasks=tasks,
         story={"data": "none: random weights for benchmarks"},
     )
 

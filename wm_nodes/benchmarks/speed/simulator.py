@@ -22,9 +22,10 @@ from benchmarks.speed.inputs import Effort, actions_of, interleave, seeds_of
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.errors import RunError
 from wm_nodes.core.memory import keep_freed_memory
-from wm_nodes.core.types import Environment
-from wm_nodes.policy_rl.factories import make_endogenous_reward, make_imagined_environment
-from wm_nodes.policy_rl.rollouts import reward_input
+from wm_nodes.core.types import Environment, Rollout
+from wm_nodes.policy_rl.device_rollout import make_collector, needs_no_pictures
+from wm_nodes.policy_rl.factories import make_endogenous_reward, make_imagined_environment, make_policy
+from wm_nodes.policy_rl.rollouts import TensorRollout, reward_input
 from wm_nodes.reward import RewardModel, RuleReward
 
 IMAGINED_ENVS, SIMULATOR_ENVS = 64, 4
@@ -37,29 +38,26 @@ Serve = Callable[[RunConfig, int, Connection], None]
 
 
 def measure_simulator(config: RunConfig, effort: Effort, model: Path, starts: Path) -> dict[str, Any]:
-    """imagined_steps_per_s: environment steps with reward, 64 imagined environments, a torch thread per core;
+    """imagined_steps_per_s: imagined_contender's, 64 environments, a torch thread per core;
     imagined_over_simulator: over those of our scene in ManiSkill with rendering and rule reward, a process per core.
     imagined_over_stock_simulator: over those of ManiSkill's own task with its own reward, as installed, two cameras of
     the same size and as much time per step. Resets are not counted on any side."""
-    endless = config.model_copy(update={"reward": config.reward.model_copy(update={"success_threshold": 1.0})})
-    imagined = make_imagined_environment(endless, model, starts, num_envs=IMAGINED_ENVS, seed=config.seed)
-    reward = make_endogenous_reward(config, model)
     cores = sorted(os.sched_getaffinity(0))
     kinds, missing = simulator_kinds(config)
     if missing:
         console.print(f"simulator left out: {missing}", highlight=False)
     console.print(f"world model against ManiSkill with rendering, {len(cores)} cores each", highlight=False)
     with ExitStack() as stack:
-        contenders = {"imagined": lambda block: rate_episode(imagined, reward, block)}
+        contenders = {"imagined": imagined_contender(config, model, starts)}
         for kind, serve in kinds.items():
             contenders[kind] = partial(rate_workers, stack.enter_context(simulator_workers(config, cores, serve)))
         blocks = interleave([*contenders.values()], effort.simulator_blocks)
     rates = {kind: float(np.median(values)) for kind, values in zip(contenders, blocks, strict=True)}
     details: dict[str, Any] = {
         "imagined_envs": IMAGINED_ENVS, "imagined_threads": torch.get_num_threads(),
-        "imagined_goals": imagined.goals() is not None, "dense_weight": config.reward.dense_weight,
+        "dense_weight": config.reward.dense_weight,
         "simulator_envs": SIMULATOR_ENVS, "simulator_processes": len(cores), "cores": len(cores), "missing": missing,
-        "reward": reward.name,
+        "reward": "endogenous",
     }
     details |= {f"{kind}_steps_per_s": rates[kind] for kind in kinds}
     ratios = [rates["imagined"] / rates[kind] if kind in kinds else None for kind in ("simulator", "stock")]
@@ -67,6 +65,18 @@ def measure_simulator(config: RunConfig, effort: Effort, model: Path, starts: Pa
         "imagined_steps_per_s": rates["imagined"], "imagined_over_simulator": ratios[0],
         "imagined_over_stock_simulator": ratios[1], "simulator": details,
     }
+
+
+def imagined_contender(config: RunConfig, model: Path, starts: Path) -> Callable[[int], float]:
+    """Steps per second of a block of the world model, with reward, to the step limit: as RL makes them, with what the
+    policy does, where it needs no pictures, else of given actions."""
+    endless = config.model_copy(update={"reward": config.reward.model_copy(update={"success_threshold": 1.0})})
+    imagined = make_imagined_environment(endless, model, starts, num_envs=IMAGINED_ENVS, seed=config.seed)
+    policy, reward = make_policy(config, model), make_endogenous_reward(config, model)
+    if not needs_no_pictures(imagined.episodes, policy, reward):
+        return partial(rate_episode, imagined, reward)
+    collect = make_collector(imagined, policy, reward)
+    return partial(rate_rollout, lambda block: collect(config.simulation.max_episode_steps, block, 0))
 
 
 def simulator_kinds(config: RunConfig) -> tuple[dict[str, Serve], str]:
@@ -161,6 +171,13 @@ def rate_workers(workers: list[Connection], block: int) -> float:
         except EOFError:
             raise RunError("a simulator process ended; its error is above") from None
     return total
+
+
+def rate_rollout(collect: Callable[[int], Rollout | TensorRollout], block: int) -> float:
+    """Steps per second of the rollout that is collected for a block."""
+    start = time.perf_counter()
+    steps = int(collect(block).valid_TN.sum())
+    return steps / (time.perf_counter() - start)
 
 
 def rate_episode(env: Environment, reward: RewardModel, block: int) -> float:

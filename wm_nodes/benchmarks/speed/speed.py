@@ -37,6 +37,8 @@ class Speed(Experiment):
     """A tenth of the work, for a first look; less exact."""
     preset: str = "cpu"
     """Model size: the name of a preset, or a .yaml."""
+    task: str = "push_cube"
+    """That both sides simulate."""
     model_dir: Path | None = None
     """World model to measure instead of the shipped one."""
     untrained: bool = False
@@ -61,12 +63,12 @@ class Speed(Experiment):
         changes = {name: value for name, value in self.settings.items() if name != "seed"}
         if (self.untrained and self.model_dir) or (changes and not self.untrained):
             raise ValueError("settings and --untrained are of a model with random weights; leave out --model-dir")
-        config = load_config(self.preset, {**changes, "seed": self.seed})
+        config = load_config(self.preset, {**changes, "seed": self.seed, "task": self.task})
         with tempfile.TemporaryDirectory(prefix="wm_benchmark_") as name:
             folder = Path(name)
             model = random_model(config, folder / "model") if self.untrained else self.model_dir
             results = measure(config, QUICK if self.quick else FULL, folder, model)
-        given = {"quick": self.quick, "preset": self.preset, "seed": self.seed}
+        given = {"quick": self.quick, "preset": self.preset, "task": self.task, "seed": self.seed}
         results |= given | {"untrained": changes if self.untrained else None}
         show(results)
         self.write(results, exact=True)

@@ -30,7 +30,7 @@ def measure_stages(config: RunConfig, effort: Effort, model: Path, starts: Path)
     tokenizer, action = models.tokenizer, models.action
     rng = numpy_stream(config.seed, "benchmark_stages")
     images, states = (array[rng.integers(0, len(array), IMAGINED_ENVS)] for array in load_starts(starts))
-    actions = rng.uniform(-1, 1, (IMAGINED_ENVS, 3)).astype(np.float32)
+    actions = rng.uniform(-1, 1, (IMAGINED_ENVS, models.spec.action_dim)).astype(np.float32)
     zeros = np.zeros(IMAGINED_ENVS, np.float32)
     sparse = config.model_copy(update={"reward": config.reward.model_copy(update={"dense_weight": 0.0})})
     dense = config.model_copy(update={"reward": config.reward.model_copy(update={"dense_weight": 1.0})})

@@ -16,7 +16,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from wm_nodes.config.load import ConfigError
-from wm_nodes.config.object_state import READER, with_truth
+from wm_nodes.config.object_state import with_truth
 from wm_nodes.config.scenes import splits
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT, MODEL_EPISODES, WEAK_POLICIES, seed_spans
@@ -41,7 +41,6 @@ from wm_nodes.recording import read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.recording.training_data import TrainingData, read_training_data
 from wm_nodes.reports.summary import plain
-from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model import ActionModel, Tokenizer, WorldModels, load_model_folder, save_model_folder
 from wm_nodes.world_model.folder import action_model_class
 from wm_nodes.world_model.position_probe import PositionProbe
@@ -153,11 +152,10 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
         chain(*bags.values()), folder / STARTS, MODEL_STARTS if len(bags) == 1 else MODEL_STARTS // 2, tasks=tasks,
         frames=config.data.start_frames, seed=config.seed,
     )
-    if eyes:  # before the manifest, which says that the folder is complete
-        save_weights(eyes, folder / READER)
     decoder = shown_by.decoder if config.tokenizer.decoder_iterations else None
     save_model_folder(
-        folder, tokenizer, action, text, config, spec=spec, tasks=tasks, story=story, probe=probe, decoder=decoder
+        folder, tokenizer, action, text, config, spec=spec, tasks=tasks, story=story, probe=probe, decoder=decoder,
+        reader=eyes,
     )
     load_model_folder(folder)
     return folder

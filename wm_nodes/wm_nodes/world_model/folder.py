@@ -11,6 +11,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import nn
 
+from wm_nodes.config.object_state import READER
 from wm_nodes.config.schema import RunConfig, TokenizerConfig, WorldModelConfig
 from wm_nodes.core.model_folder import (
     ModelFolderError,
@@ -20,7 +21,7 @@ from wm_nodes.core.model_folder import (
     write_model_folder,
 )
 from wm_nodes.core.specs import EnvironmentSpec, spec_of_values, spec_values, tool_spec
-from wm_nodes.training.weights import WeightsError, check_same_layout
+from wm_nodes.training.weights import WeightsError, check_same_layout, pack_weights
 from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.positions import num_positions_of
@@ -36,6 +37,7 @@ FILES = {
     "action": "action_model.safetensors",
     "text": "text_model.safetensors",
     "probe": "position_probe.safetensors",
+    "reader": READER,
 }
 FORMAT = 2
 
@@ -77,19 +79,22 @@ class WorldModels:
 def save_model_folder(
     folder: Path, tokenizer: Tokenizer, action: ActionModel | TokenActionModel, text: TextModel | None,
     config: RunConfig, *, spec: EnvironmentSpec, tasks: tuple[str, ...], story: Mapping[str, Any],
-    probe: PositionProbe | None = None, decoder: nn.Module | None = None,
+    probe: PositionProbe | None = None, decoder: nn.Module | None = None, reader: nn.Module | None = None,
 ) -> Path:
-    """Write the models, made with `config`, as float16, and the manifest.
+    """Write the models, made with `config`, as float16 (what is `exact` as float32), and the manifest.
 
     Args:
         spec: of the environment whose episodes the models were trained on.
         story: further entries of the manifest: data, seeds, commands, metrics, machine, date.
         decoder: of rollouts, see train_decoder; None: the tokenizer's.
+        reader: an ObjectReader; environments load it alone.
     """
     modules: dict[str, nn.Module | None] = {
         "tokenizer": tokenizer, "decoder": decoder, "action": action, "text": text, "probe": probe,
     }
     packed = {key: _pack(module) for key, module in modules.items() if module is not None}
+    if reader is not None:
+        packed["reader"] = pack_weights(reader).data
     for key in FILES.keys() - packed.keys():
         (folder / FILES[key]).unlink(missing_ok=True)
     manifest: dict[str, Any] = {
@@ -156,6 +161,8 @@ def load_model_folder(
     if "probe" in manifest["sha256"]:
         probe = PositionProbe(spec.height, spec.width, num_positions)
         _load(folder, "probe", probe, manifest)
+    if "reader" in manifest["sha256"]:
+        read_model_file(folder / READER, manifest["sha256"]["reader"])
     for module in (tokenizer, action, text, probe):
         if module is not None:
             module.to(device)
@@ -205,9 +212,13 @@ def _load(folder: Path, key: str, module: nn.Module, manifest: Mapping[str, Any]
 
 
 def _pack(module: nn.Module) -> bytes:
-    """Return a module's weights as float16, safetensors."""
+    """Return a module's weights as safetensors: float16, those of parts that are `exact` as they are."""
     tensors = {name: tensor.detach().cpu() for name, tensor in module.state_dict().items()}
-    data: bytes = save({name: (t.half() if t.is_floating_point() else t).contiguous() for name, t in tensors.items()})
+    exact = tuple(f"{name}." for name, part in module.named_modules() if getattr(part, "exact", False))
+    data: bytes = save({
+        name: (t.half() if t.is_floating_point() and not name.startswith(exact) else t).contiguous()
+        for name, t in tensors.items()
+    })
     return data
 
 
