@@ -9,7 +9,7 @@ import torch
 from pushing_scene import episode, stacked_scene
 
 from wm_nodes.config.load import load_config
-from wm_nodes.config.object_state import READER, with_reader, with_truth
+from wm_nodes.config.object_state import READER, of_demonstrations, with_reader, with_truth
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.environments.object_reader import ObjectReader, keypoints, load_object_reader
 from wm_nodes.environments.registry import configured_spec
@@ -81,3 +81,11 @@ def test_states_say_the_truth_while_a_model_is_made_and_then_what_its_reader_see
     (tmp_path / READER).touch()
     assert with_reader(plain, tmp_path).simulation.object_state == str(tmp_path / READER)
     assert with_reader(with_truth(made), tmp_path).simulation.object_state == "truth"
+
+
+def test_demonstrations_say_the_truth_where_a_policy_learns_both_it_and_what_is_read() -> None:
+    both = {"task": "push", "simulation.object_state": "reader.safetensors", "sft.state_noise_m": 0.004}
+    assert of_demonstrations(load_config("base", both)).simulation.object_state == "truth"
+    for plain in ({**both, "sft.state_noise_m": 0.0}, {**both, "simulation.object_state": ""}):
+        config = load_config("base", plain)
+        assert of_demonstrations(config) is config

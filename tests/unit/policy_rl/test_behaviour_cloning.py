@@ -145,3 +145,22 @@ def test_of_a_recovery_only_what_the_expert_acted_is_learned_and_only_where_the_
                for one in (taken_over[0], wrong)]
     assert [result.num_samples for result in results] == [steps[0] - 1 + steps[1]] * 2
     np.testing.assert_array_equal(results[0].losses, results[1].losses)
+
+
+def test_a_policy_relies_less_on_a_value_that_has_noise() -> None:
+    dark = [replace(demo, images=np.zeros_like(demo.images)) for demo in DEMOS]
+    moved, states = list[float](), np.concatenate([demo.states[:-1] for demo in dark])
+    images, beside = np.concatenate([demo.images[:-1] for demo in dark]), states + np.array([0.03, 0, 0])
+    for noise in (0.0, 0.5):
+        policy = toy_policy()
+        train_sft(policy, dark, settings(state_noise_m=noise), 0, noisy=[0])
+        here, there = (policy.act(images, seen.astype(np.float32)).actions for seen in (states, beside))
+        moved.append(float(np.abs(there - here)[:, 0].mean()))
+    assert moved[1] < 0.5 * moved[0]
+
+
+def test_without_noise_the_values_that_would_have_it_change_nothing() -> None:
+    first, second = toy_policy(), toy_policy()
+    train_sft(first, DEMOS[:4], settings(num_iterations=5), 0)
+    train_sft(second, DEMOS[:4], settings(num_iterations=5), 0, noisy=[0, 1])
+    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))

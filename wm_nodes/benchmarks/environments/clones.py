@@ -10,6 +10,7 @@ from benchmarks.environments.experiments import Configured
 from benchmarks.environments.policies import SIMULATOR, Workplace, rate_of, rate_over_seeds
 from benchmarks.experiment import Count, console
 from wm_nodes.config.load import load_config
+from wm_nodes.config.object_state import of_demonstrations
 from wm_nodes.config.scenes import splits
 from wm_nodes.config.schema import PolicyInputs
 from wm_nodes.config.shipped import shipped_model
@@ -60,10 +61,9 @@ class Clones(Configured):
     def _row(self, place: Workplace) -> Iterator[dict[str, Any]]:
         """Plan demonstrations where they are missing, clone them and measure the policy."""
         config, most = place.config, max(self.demonstrations)
-        plan = demonstration_plan(
-            config.with_values(sft=config.sft.with_values(num_demonstrations=most)), most + max(3, most // 3)
-        )
-        bags = collect_plan(plan, config, place.folder / "demos")
+        recorded = of_demonstrations(config.with_values(sft=config.sft.with_values(num_demonstrations=most)))
+        plan = demonstration_plan(recorded, most + max(3, most // 3))
+        bags = collect_plan(plan, recorded, place.folder / "demos")
         weights = place.folder / f"{config.policy.inputs}_{config.sft.num_demonstrations}.safetensors"
         policy = train_weak_policy(config, place.model_dir, bags, weights)
         yield {"success": {name: rate_of(place.real(policy, name)) for name in splits()}}

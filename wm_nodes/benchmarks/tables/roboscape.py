@@ -32,7 +32,7 @@ from wm_nodes.config.tasks import parts_of
 from wm_nodes.core.statistics import t_interval
 
 REWARDS, RECOVERIES = "roboscape_rewards.json", "roboscape_recoveries.json"
-TRAINED = "roboscape_table1.json", "roboscape_more.json", "roboscape_tasks.json"
+TRAINED = tuple(f"roboscape_{name}.json" for name in ("table1", "more", "tasks", "state"))
 PPO, CLONES, EXTREME, SEVERAL, UNAIDED = (
     f"roboscape_{name}.json" for name in ("ppo", "clones", "extreme_actions", "table2", "no_positions")
 )
@@ -40,6 +40,8 @@ AFTER = 1, 8, 32
 """Steps of a rollout at which its pictures are compared."""
 DOMAINS = "IND", "OOD"
 POSITIONS = "positions"
+SEEN = POSITIONS, "latents", "state"
+"""Values of policy.inputs."""
 OURS = "reach_object"
 """A task that the paper does not have."""
 PAYS = {
@@ -59,7 +61,7 @@ def trained(training: str, task: str, inputs: str = POSITIONS) -> list[Run]:
 
 
 def table_1() -> Rows:
-    for task, inputs, training in product((*TASKS, OURS), (POSITIONS, "latents"), (*TABLE_1, REFRESHED)):
+    for task, inputs, training in product((*TASKS, OURS), SEEN, (*TABLE_1, REFRESHED)):
         if of := trained(training, task, inputs):
             papers = (PAPER.get((training, domain)) if task in TASKS else None for domain in DOMAINS)
             yield (
@@ -80,7 +82,7 @@ def _shown_to(row: Run) -> str:
 
 def table_1_gains() -> Rows:
     for training, inputs, base, task in product(
-        (MODEL, GOAL, PROGRESS, REFRESHED), (POSITIONS, "latents"), (SFT, ONE_SCENE, ALL_SCENES), (*TASKS, OURS)
+        (MODEL, GOAL, PROGRESS, REFRESHED), SEEN, (SFT, ONE_SCENE, ALL_SCENES), (*TASKS, OURS)
     ):
         if text := gain([*trained(training, task, inputs), *trained(base, task, inputs)], base, training):
             yield task, inputs, PAYS[training], LABELS[base], text

@@ -16,6 +16,18 @@ def with_truth(config: RunConfig) -> RunConfig:
     return config.with_values(simulation=config.simulation.with_values(object_state=TRUTH))
 
 
+def is_read(config: RunConfig) -> bool:
+    """Whether a reader fills simulation.object_state."""
+    return config.simulation.object_state not in ("", TRUTH)
+
+
+def of_demonstrations(config: RunConfig) -> RunConfig:
+    """The configuration that demonstrations are recorded with, see sft.state_noise_m."""
+    if not (config.sft.state_noise_m and is_read(config)):
+        return config
+    return config.with_values(simulation=config.simulation.with_values(object_state=TRUTH))
+
+
 def with_reader(config: RunConfig, model_dir: Path | None) -> RunConfig:
     """The configuration whose states say what the reader of the model's folder sees, where the folder has one and the
     settings name nothing else."""

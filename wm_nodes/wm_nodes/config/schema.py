@@ -261,6 +261,9 @@ class SftConfig(SettingsSection):
     recoveries: NonNegativeInt = 0
     """Further demonstrations, which the task's script acts from where a clone of the others has got to after some of
     its steps; only the script's are learned."""
+    state_noise_m: NonNegativeFloat = 0.0
+    """Above 0, where a reader fills simulation.object_state: demonstrations say the truth there and are learned once
+    more as it is read, both off by noise of this standard deviation, drawn anew for every gradient step."""
 
 
 class PpoConfig(SettingsSection):

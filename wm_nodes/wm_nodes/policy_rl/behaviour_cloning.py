@@ -45,9 +45,9 @@ class _Frames:
     actions_BA: Tensor
     """Demonstrated there."""
 
-    def error(self, policy: ImagePolicy, rows: Tensor | slice = slice(None)) -> Tensor:
-        """See ImagePolicy.cloning_error."""
-        return policy.cloning_error(self.features_BF[rows], self.states_BS[rows], self.actions_BA[rows])
+    def error(self, policy: ImagePolicy, rows: Tensor | slice = slice(None), noise: Tensor | float = 0.0) -> Tensor:
+        """See ImagePolicy.cloning_error. noise: on the states."""
+        return policy.cloning_error(self.features_BF[rows], self.states_BS[rows] + noise, self.actions_BA[rows])
 
 
 def demonstrations(
@@ -80,7 +80,7 @@ def expert_from(episode: Episode) -> int:
 
 def train_sft(
     policy: ImagePolicy, demos: Sequence[Episode], config: SftConfig, seed: int, *,
-    reconstruct: Callable[[UInt8Array], UInt8Array] | None = None,
+    reconstruct: Callable[[UInt8Array], UInt8Array] | None = None, noisy: Sequence[int] = (),
 ) -> SftResult:
     """Fit the actor's mean to the demonstrated actions in place; critic and log standard deviation stay. With
     config.heldout the last demonstrations are not learned, and the weights with the least error on them are kept.
@@ -88,7 +88,8 @@ def train_sft(
     Steps after the first success are left out: an episode ends there when a policy acts; and those of a recovery before
     its expert has taken over. The demonstrations also set
     the policy's feature normalisation. Every image counts once, and with `reconstruct` (the tokenizer's decode of
-    encode, uint8 (B, H, W, 3)) once more as the world model will show it. `seed` draws the batches (stream `sft`).
+    encode, uint8 (B, H, W, 3)) once more as the world model will show it. `seed` draws the batches (stream `sft`) and
+    the noise of config.state_noise_m on the values `noisy` of the states (`sft_states`).
     With one seed and one number of torch threads the result is bit-identical on a CPU.
 
     Raises:
@@ -109,7 +110,8 @@ def train_sft(
     optimizer = torch.optim.AdamW(
         policy.actor.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
     )
-    generator, hiding = torch_stream(seed, "sft"), torch_stream(seed, "sft_dropout")
+    generator, hiding, reading = (torch_stream(seed, name) for name in ("sft", "sft_dropout", "sft_states"))
+    noise = torch.zeros(config.batch_size, learned.states_BS.shape[1])
     dropout, losses, errors = policy.config.dropout, list[Tensor](), dict[int, float]()
     best, actor = copy.deepcopy(policy.state_dict()), cast(Any, policy.actor)
     for step in range(1, config.num_iterations + 1):
@@ -117,7 +119,9 @@ def train_sft(
         if dropout:
             draws = torch.rand(config.batch_size, policy.config.projection, generator=hiding)
             actor.kept = (draws >= dropout).float().to(policy.device) / (1 - dropout)
-        loss = learned.error(policy, index)
+        if config.state_noise_m:
+            noise[:, noisy] = config.state_noise_m * torch.randn(config.batch_size, len(noisy), generator=reading)
+        loss = learned.error(policy, index, noise.to(policy.device))
         actor.kept = None
         optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]

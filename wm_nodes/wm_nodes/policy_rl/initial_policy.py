@@ -13,12 +13,14 @@ import torch
 from safetensors.torch import save
 
 from wm_nodes.config import seed_ranges
+from wm_nodes.config.object_state import is_read, of_demonstrations
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task, has_rule, has_simulator, success
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import RECOVERY, Episode
 from wm_nodes.environments.collection import CollectionPlan
+from wm_nodes.environments.object_reader import load_object_reader
 from wm_nodes.environments.record import (
     collect_plan,
     demonstration_plan,
@@ -132,9 +134,13 @@ def train_weak_policy(
     if more := [*recoveries]:
         recovered = (e for bag in more for e in read_episodes(bag, expected=spec))
         demos += demonstrations(recovered, config.sft.recoveries, RECOVERY, "sft.recoveries")
+    if config.sft.state_noise_m and is_read(config):
+        reader = load_object_reader(Path(config.simulation.object_state), spec)
+        demos = [twin for demo in demos for twin in (demo, replace(demo, states=reader.fill(demo.images, demo.states)))]
     sees = policy.encoder.feature_dim > 0
     shown = make_reconstruct(model_dir, config.device) if sees else None
-    train_sft(policy, demos, config.sft, config.seed, reconstruct=shown)
+    lengths = [i for i in spec.measured if spec.state_units[i] == "m"]
+    train_sft(policy, demos, config.sft, config.seed, reconstruct=shown, noisy=lengths)
     save_weights(policy, path, {"tokenizer_sha256": policy.encoder.sha256})
     return policy
 
@@ -179,12 +185,13 @@ def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Pa
         ValueError: the folder holds those of other settings or of another tokenizer.
     """
     _keep_settings(config, run_dir, model_dir)
+    recorded = of_demonstrations(config)
     demos = [Path(bag) for bag in config.sft.bags]
     if config.sft.recoveries and not has_simulator(config.task):
         raise ValueError(f"sft.recoveries {config.sft.recoveries} need a script, and nothing simulates the task; set 0")
     if not demos:
-        plan = demonstration_plan(config, planned_demonstrations(config))
-        demos = collect_plan(plan, config, run_dir / "bags" / "demos")
+        plan = demonstration_plan(recorded, planned_demonstrations(config))
+        demos = collect_plan(plan, recorded, run_dir / "bags" / "demos")
     starts, weak = start_files(run_dir)
     if not starts.exists() and not has_simulator(config.task):
         write_atomic(starts, (model_dir / STARTS).read_bytes())
@@ -197,8 +204,8 @@ def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Pa
             clone = weak.with_name("clone.safetensors")
             train_weak_policy(config, model_dir, demos, clone, anyone=anyone)
             plan = recovery_plan(
-                config, partial(policy_actor, config, model_dir, clone), planned_demonstrations(config)
+                recorded, partial(policy_actor, config, model_dir, clone), planned_demonstrations(config)
             )
-            recoveries = collect_plan(plan, config, run_dir / "bags" / "recoveries")
+            recoveries = collect_plan(plan, recorded, run_dir / "bags" / "recoveries")
         train_weak_policy(config, model_dir, demos, weak, anyone=anyone, recoveries=recoveries)
     return starts, weak
