@@ -13,9 +13,10 @@ from wm_nodes.core.differences import NEAR_M, Differences
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.environments.registry import configured_spec
-from wm_nodes.policy_rl.device_rollout import DeviceCollector, make_collector
+from wm_nodes.policy_rl.device_rollout import DeviceCollector, make_collector, unseen_pictures_left_out
 from wm_nodes.policy_rl.factories import make_endogenous_reward, make_policy
 from wm_nodes.policy_rl.rollouts import TensorRollout, collect_rollout
+from wm_nodes.policy_rl.validation.evaluation import evaluate
 from wm_nodes.world_model import (
     ActionModel,
     DeviceEnvironment,
@@ -116,7 +117,7 @@ def told_models(config: RunConfig, path: Path) -> tuple[WorldModels, tuple[np.nd
     assert models.action.state_model is not None and models.action.state_change is None
     with torch.no_grad():
         for parameter in models.action.state_model.parameters():
-            parameter.add_(0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0)))
+            parameter.add_(0.03 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0)))
     images = numpy_stream(0, "pictures").integers(0, 256, (2, spec.height, spec.width, 3), np.uint8)
     states = np.full((2, spec.state_dim), 0.5, np.float32)
     states[1, spec.state_names.index("object_x")] += 0.2
@@ -156,6 +157,22 @@ def test_without_pictures_everything_else_is_the_same(config: RunConfig, tmp_pat
         ours, theirs = getattr(dark, f"{name}_TN").numpy(), getattr(seen, f"{name}_TN")
         np.testing.assert_array_equal(ours, theirs, name)
     assert (seen.images_TN[1:] != seen.images_TN[:-1]).any()
+
+
+def test_a_policy_is_measured_without_the_pictures_that_it_does_not_see(config: RunConfig, tmp_path: Path) -> None:
+    models, starts = told_models(config, tmp_path)
+    env = ImaginedEnvironment(models, configured_spec(config), starts, config.reward, num_envs=2, seed=0)
+    policy = make_policy(config, tmp_path)
+    shown = evaluate(policy, env, 4, 0)
+    with unseen_pictures_left_out(env, policy):
+        assert not env.episodes.pictures
+        hidden = evaluate(policy, env, 4, 0)
+    assert env.episodes.pictures
+    np.testing.assert_array_equal(hidden.success, shown.success)
+    np.testing.assert_array_equal(hidden.length, shown.length)
+    looking = make_policy(config.with_values(policy=config.policy.with_values(inputs="latents")), tmp_path)
+    with unseen_pictures_left_out(env, looking):
+        assert env.episodes.pictures
 
 
 def test_who_looks_has_pictures(config: RunConfig, tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.statistics import paired_difference, t_interval, wilson_interval
 from wm_nodes.core.types import Environment
 from wm_nodes.environments.registry import make_environment
+from wm_nodes.policy_rl.device_rollout import unseen_pictures_left_out
 from wm_nodes.policy_rl.factories import (
     load_policy,
     make_imagined_environment,
@@ -114,8 +115,9 @@ class Workplace:
         }
 
     def imagined(self, policy: ImagePolicy, env: Environment) -> EvaluationResult:
-        return evaluate(policy, env, min(IMAGINED_EPISODES, 8 * self.config.evaluation.episodes),
-                        self.config.evaluation.first_seed)
+        with unseen_pictures_left_out(env, policy):
+            return evaluate(policy, env, min(IMAGINED_EPISODES, 8 * self.config.evaluation.episodes),
+                            self.config.evaluation.first_seed)
 
 
 def train_in(

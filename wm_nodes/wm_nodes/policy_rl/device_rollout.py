@@ -7,7 +7,8 @@ Shapes: T time, N environments, M starts, F features, S state, A action.
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
@@ -71,11 +72,25 @@ def make_collector(
     return partial(collect_rollout, env, policy, reward, envs_per_start=envs_per_start)
 
 
-def needs_no_pictures(env: DeviceEnvironment, policy: ImagePolicy, reward: RewardModel) -> bool:
+def needs_no_pictures(env: DeviceEnvironment, policy: ImagePolicy, reward: RewardModel | None = None) -> bool:
     """Whether episodes are the same without pictures, which are most of the work: states alone say what happens
-    (world_model.state_model_iterations), and nobody looks."""
-    pays_for_states = isinstance(reward, EndogenousReward) and reward.config.dense_weight == 0
+    (world_model.state_model_iterations), and nobody looks. reward: None: none is given."""
+    pays_for_states = reward is None or (isinstance(reward, EndogenousReward) and reward.config.dense_weight == 0)
     return env.is_told and policy.encoder.inputs == "state" and pays_for_states
+
+
+@contextmanager
+def unseen_pictures_left_out(env: Environment, policy: ImagePolicy) -> Iterator[None]:
+    """While the policy alone looks, leave pictures out that it does not see."""
+    episodes = env.episodes if isinstance(env, ImaginedEnvironment) else None
+    if episodes is None or not needs_no_pictures(episodes, policy):
+        yield
+        return
+    episodes.pictures = False
+    try:
+        yield
+    finally:
+        episodes.pictures = True
 
 
 class DeviceCollector:

@@ -192,6 +192,7 @@ class DeviceEnvironment(DeviceEpisodes):
         now, latents = self.states_NP[:, :tool].contiguous(), self.imagined[0].latents_NSD
         with self._autocast(exact=self._exact):
             found = next_states(self._models[0], latents, actions_NA, now, self._earlier_NP, moved[:, :tool])
+        self.finite.logical_and_(torch.isfinite(found).all())
         put_where(~self._ended_N, self._earlier_NP, now)
         return torch.cat([found, moved[:, tool:]], 1)
 
@@ -217,10 +218,7 @@ class DeviceEnvironment(DeviceEpisodes):
     def _told(self, model: ActionModel | TokenActionModel, moved_NP: Tensor) -> Tensor:
         """Done logits (N, K, J) by the states alone."""
         assert model.state_model is not None  # see pictures
-        after = moved_NP[:, : self.spec.tool_dim]
-        self.finite.logical_and_(torch.isfinite(after).all())
-        logits: Tensor = model.state_model.done_logits(after)
-        return logits
+        return model.state_model.done_logits(moved_NP[:, : self.spec.tool_dim])
 
     @staticmethod
     def _agreed(logits: Sequence[Tensor], tasks_N: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,6 +5,7 @@ from pathlib import Path
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.environments.record import acceptance_plan, collect_plan, keep_plan
 from wm_nodes.environments.registry import is_simulated, make_environment
+from wm_nodes.policy_rl.device_rollout import unseen_pictures_left_out
 from wm_nodes.policy_rl.factories import STARTS, make_imagined_environment, make_video_environment, models_of
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import write_starts
@@ -72,6 +73,7 @@ def _roll_out(
     env = make(config, video_model_dir or model_dir, starts, num_envs=num_envs, seed=config.seed)
     simulator = make_environment(config, config.evaluation.environment, num_envs=1, seed=0, pictures=False)
     try:
-        return CloneRollouts(*imagine_and_replay(policy, env, simulator, seeds, config.seed))
+        with unseen_pictures_left_out(env, policy):
+            return CloneRollouts(*imagine_and_replay(policy, env, simulator, seeds, config.seed))
     finally:
         simulator.close()
