@@ -27,11 +27,13 @@ from wm_nodes.world_model import (
     save_model_folder,
 )
 from wm_nodes.world_model.dynamics import done_signal
+from wm_nodes.world_model.positions import position_names
 from wm_nodes.world_model.state_model import StateModel
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.training import state_model as training
 from wm_nodes.world_model.training.latent_episodes import LatentEpisodes
 from wm_nodes.world_model.training.state_model import train_state_model
+from wm_nodes.world_model.validation.open_loop import places_of_states
 
 SETTINGS = {
     "task": "push", "simulation.object_state": "truth", "policy.inputs": "state", "tokenizer.width": 16,
@@ -235,3 +237,15 @@ def test_a_task_that_says_of_nothing_where_it_is_has_no_such_state(config: RunCo
     with pytest.raises(ValueError, match="task push_cube says of nothing where it is; leave it empty"):
         configured_spec(cube)
     assert replace(configured_spec(config), num_envs=3).measured == tuple(range(7, 16))
+
+
+def test_places_that_states_say_are_in_the_frame_of_the_truth() -> None:
+    names = ("tool_target_x", "tool_target_y", "gripper_target", "object_x", "object_y")
+    columns = position_names("push")
+    truth = numpy_stream(0, "truth").uniform(-0.3, 0.3, (5, 3, len(columns))).astype(np.float32)
+    shift = np.array([0.6, 0.0, 0.0, 0.6, 0.0], np.float32)
+    said = [columns.index(name) if name in columns else 0 for name in ("tool_x", "tool_y", "", "object_x", "object_y")]
+    places = places_of_states(truth[..., said] + shift, names, "push", truth[:, 0])
+    known = [columns.index(name) for name in ("tool_x", "tool_y", "object_x", "object_y")]
+    np.testing.assert_allclose(places[..., known], truth[..., known], atol=1e-6)
+    assert np.isnan(places[..., columns.index("goal_x")]).all()

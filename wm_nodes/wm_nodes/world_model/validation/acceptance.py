@@ -3,7 +3,8 @@ before that policy is trained in it (RS-12).
 
 The numbers of held-out episodes come from open_loop.py: recorded actions rolled out open-loop from recorded first
 frames. Positions are read off the imagined pictures by the judge's own probe; "copying" reads them off the first frame
-instead. Those of the policy come from rollouts of its own (policy_rl/validation/acceptance.py).
+instead. Where the policy sees the state alone, positions are those that states say. Those of the policy come from
+rollouts of its own (policy_rl/validation/acceptance.py).
 """
 
 import math
@@ -64,8 +65,16 @@ def model_metrics(models: WorldModels, heldout: EpisodeArrays, config: RunConfig
     """Return the metrics of rollouts of held-out actions against the recordings; see open_loop.evaluate_rollouts, and
     pictures.picture_metrics where no positions are known."""
     threshold, imagined = config.reward.success_threshold, imagine_episodes(models.tokenizer, models.action, heldout)
-    metrics = evaluate_rollouts(models.tokenizer, imagined, heldout, threshold=threshold, probe=models.probe)
+    metrics = evaluate_rollouts(
+        models.tokenizer, imagined, heldout, threshold=threshold, probe=models.probe,
+        state_names=models.spec.state_names if _sees_states(models, config) else (),
+    )
     return metrics if _has_positions(metrics) else metrics | picture_metrics(models, imagined, heldout)
+
+
+def _sees_states(models: WorldModels, config: RunConfig) -> bool:
+    """Whether the policy sees nothing of the pictures, and a model of states moves what it sees."""
+    return config.policy.inputs == "state" and models.action.state_model is not None
 
 
 def accept_world_model(

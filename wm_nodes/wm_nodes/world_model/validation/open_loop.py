@@ -24,7 +24,7 @@ from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.reward.picture_similarity import psnr_db, ssim
 from wm_nodes.world_model.dynamics import ActionModel, done_signal
 from wm_nodes.world_model.position_probe import PositionProbe
-from wm_nodes.world_model.positions import columns_of
+from wm_nodes.world_model.positions import columns_of, position_names
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.state_model import next_states
 from wm_nodes.world_model.token_dynamics import TokenActionModel
@@ -47,6 +47,8 @@ class ImaginedEpisodes:
     """float32 (E, T, J), pessimistic done probability of frames 1..T."""
     uncertainty: FloatArray
     """float32 (E, T, J)."""
+    states: FloatArray
+    """float32 (E, T, S), of frames 1..T; measured values as the model predicts them."""
 
 
 @torch.inference_mode()
@@ -75,7 +77,7 @@ def imagine(
     current = tokenizer.encode(images)
     actions_ETA, states_ETS = (torch.from_numpy(array).to(current.device) for array in (actions, states))
     caches = model.trunk.new_ring_caches(len(images), current.device)
-    frames, signals, spreads = list[Tensor](), list[Tensor](), list[Tensor]()
+    frames, signals, spreads, reached = list[Tensor](), list[Tensor](), list[Tensor](), list[Tensor]()
     earlier = before = states_ETS[:, 0]
     for t in range(actions.shape[1]):
         acted, after = actions_ETA[:, t], states_ETS[:, t + 1]
@@ -87,7 +89,8 @@ def imagine(
         frames.append(tokenizer.decode(current))
         signals.append(signal)
         spreads.append(spread)
-    return ImaginedEpisodes(*(torch.stack(steps, 1).cpu().numpy() for steps in (frames, signals, spreads)))
+        reached.append(after)
+    return ImaginedEpisodes(*(torch.stack(steps, 1).cpu().numpy() for steps in (frames, signals, spreads, reached)))
 
 
 def position_reader(tokenizer: Tokenizer, probe: PositionProbe | None) -> Callable[[UInt8Array], FloatArray]:
@@ -95,10 +98,23 @@ def position_reader(tokenizer: Tokenizer, probe: PositionProbe | None) -> Callab
     return probe.read if probe else partial(_read_frames, tokenizer)
 
 
+def places_of_states(
+    states: FloatArray, state_names: Sequence[str], task: str, first_truth: FloatArray
+) -> FloatArray:
+    """Positions (E, T, P) that states (E, T, S) say, NaN where they say none; of the tool those commanded. first_truth:
+    (E, P), of the first states, by which the frame of the states is known."""
+    places: FloatArray = np.full((*states.shape[:2], first_truth.shape[-1]), np.nan, np.float32)
+    for column, name in enumerate(position_names(task)):
+        for said in {name, name.replace("tool_", "tool_target_")} & {*state_names}:
+            values = states[..., state_names.index(said)]
+            places[..., column] = values + np.median(first_truth[:, column] - values[:, 0])
+    return places
+
+
 @torch.inference_mode()
 def evaluate_rollouts(
     tokenizer: Tokenizer, imagined: ImaginedEpisodes, episodes: EpisodeArrays, *, threshold: float = 0.7,
-    probe: PositionProbe | None = None,
+    probe: PositionProbe | None = None, state_names: Sequence[str] = (),
 ) -> dict[str, float]:
     """Metrics by name of the episodes' rollouts (see docs/metrics.md); positions in cm, PSNR in dB, `_hNN` at step NN.
 
@@ -109,6 +125,9 @@ def evaluate_rollouts(
 
     Without ground truth, where the tasks' files name no positions, or where the model reads none, there is no object_
     and tool_ and no moved_share.
+
+    Args:
+        state_names: positions are those that states say, of these values (places_of_states), in place of pictures.
     """
     truth = episode_targets(episodes)
     metrics: dict[str, float] = {"episodes": float(len(episodes))}
@@ -116,8 +135,13 @@ def evaluate_rollouts(
     has_reader = probe is not None or tokenizer.num_positions > 0
     has_positions = has_reader and truth.shape[-1] > 0 and bool(thing and tool)
     if has_positions:
-        read = position_reader(tokenizer, probe)
-        real, predicted = read(episodes.images), read(imagined.frames)
+        if state_names:
+            reached = np.concatenate([episodes.states, imagined.states], 1)
+            places = places_of_states(reached, state_names, episodes.tasks[0], truth[:, 0])
+            real, predicted = places[:, : episodes.num_steps + 1], places[:, episodes.num_steps + 1 :]
+        else:
+            read = position_reader(tokenizer, probe)
+            real, predicted = read(episodes.images), read(imagined.frames)
         moved = np.linalg.norm(truth[:, -1, thing] - truth[:, 0, thing], axis=-1) > MOVED_M
         metrics["moved_share"] = float(moved.mean())
     for horizon in sorted({min(h, episodes.num_steps) for h in HORIZONS}):
