@@ -252,6 +252,14 @@ def test_the_state_says_where_things_are_in_the_base_frame() -> None:
     assert env.spec.commanded_dim == 7 and np.ptp(named["tool_target_z"]) > 0.1
 
 
+@pytest.mark.parametrize(("task", "carpet"), [("pick_place", False), ("reach_object", False), ("move_to_aim", True)])
+def test_the_state_says_a_goal_where_a_carpet_is_one_and_nowhere_else(task: str, carpet: bool) -> None:
+    simulation = load_config("cpu", {"task": task, "simulation.object_state": TRUTH}).simulation
+    with closing(ManiSkillEnvironment(task, simulation, pictures=False)) as env:
+        state = dict(zip(env.spec.state_names, env.reset(seeds=np.array([3], np.uint64)).state[0], strict=True))
+    assert (state["goal_x"] != 0) == carpet and state["container_x"] != 0
+
+
 def test_a_reader_reads_the_state_and_the_start_is_what_it_read_at_the_reset(tmp_path: Path) -> None:
     spec = configured_spec(load_config("cpu", {"task": "push", "simulation.object_state": TRUTH}))
     torch.manual_seed(0)

@@ -84,6 +84,8 @@ class SimulatorPart:
     """What an action is, see core/action_spaces.py: translation, A = S = 3, or pose, 7 with rotation and gripper."""
     object_state: tuple[str, ...] = ()
     """Ground-truth names of lengths along x, y or z that a state may hold, see simulation.object_state."""
+    hidden_state: tuple[str, ...] = ()
+    """Those of them that the task's pictures do not show: 0 in states."""
     instruct: Callable[[Scene], str] | None = None
     """The instruction in one scene; None: the task has a scene of its own, and simulation.scenes is empty."""
 

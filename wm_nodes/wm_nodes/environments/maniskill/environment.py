@@ -164,11 +164,11 @@ class ManiSkillEnvironment:
                     read[names.index(name)] = read[names.index(name.replace("start_", ""))]
             state[:] = read
         else:
-            shown = get_task(self._parts[i]).model.positions
+            hidden = simulator_part(self._parts[i]).hidden_state
             for column in self.spec.measured:
                 name = names[column]
                 place = self._truth[i, self.spec.ground_truth_names.index(name)] - ROBOT_BASE["xyz".index(name[-1])]
-                state[column] = 0.0 if name.startswith("goal_") and name not in shown else place
+                state[column] = 0.0 if name in hidden else place
 
     def current(self) -> Observation:
         """The observation as of the last reset or step."""

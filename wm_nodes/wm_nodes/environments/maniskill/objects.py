@@ -24,7 +24,9 @@ WITH_GOAL = POSITIONS | {name: name for name in ("goal_x", "goal_y")}
 STARTS = ("object_start_x", "object_start_y")
 """Where the object was at the reset."""
 STATE = ("object_x", "object_y", "object_z", "container_x", "container_y", "goal_x", "goal_y", *STARTS)
-"""What a state may hold of the ground truth: where pictures do not show the goal, 0 instead of it."""
+"""What a state may hold of the ground truth."""
+NO_CARPET = ("goal_x", "goal_y")
+"""What is hidden where no carpet is the goal: a container that is the goal is told as container."""
 MIDDLE_M = 0.02
 """About where the middle of an object is above the table."""
 OBJECT, OBJECT_START = CUBE, CUBE_START

@@ -50,7 +50,7 @@ TASK = Task(
     settings={**objects.SETTINGS, **objects.GRASPING, **objects.policy_sees("container"), "data.behaviours": CARRYING},
     simulator=SimulatorPart(
         scene, objects.measure, place_waypoints, scripted(place_waypoints, speed=0.8), actions="pose",
-        object_state=objects.STATE, instruct=instruct,
+        object_state=objects.STATE, hidden_state=objects.NO_CARPET, instruct=instruct,
     ),
     model=ModelPart(
         tasks=objects.MODEL_TASKS, positions=objects.WITH_GOAL, weak_policies=objects.weak_policies(1)

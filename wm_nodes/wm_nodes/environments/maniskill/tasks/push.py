@@ -54,7 +54,7 @@ def instruct(scene: Scene) -> str:
 
 SIMULATOR = SimulatorPart(
     scene, objects.measure, waypoints, scripted(waypoints, speed=0.5), actions="pose", instruct=instruct,
-    object_state=objects.STATE,
+    object_state=objects.STATE, hidden_state=objects.NO_CARPET,
 )
 TASK = Task(
     instruction="push the object away from the robot",

@@ -53,7 +53,7 @@ TASK = Task(
     settings={**objects.SETTINGS, **objects.policy_sees(), "data.behaviours": MOVING},
     simulator=SimulatorPart(
         scene, objects.measure, waypoints, scripted(waypoints, speed=0.8), actions="pose", instruct=instruct,
-        object_state=objects.STATE,
+        object_state=objects.STATE, hidden_state=objects.NO_CARPET,
     ),
     model=ModelPart(
         tasks=objects.MODEL_TASKS, positions=objects.POSITIONS, moves_object=False,
