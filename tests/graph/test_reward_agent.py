@@ -262,6 +262,11 @@ def said(capsys: pytest.CaptureFixture[str]) -> str:
     return " ".join(capsys.readouterr().out.split())
 
 
+def _made(transitions: list[Any]) -> dict[int, Any]:
+    """Of those that have arrived, by number, the lock-steps in which something moved; more may be on their way."""
+    return {step.step_id: step for step in transitions if any(step.valid)}
+
+
 def test_a_policys_episodes_are_judged_at_their_end_and_a_judge_that_is_down_pauses_training(
     server: PickyServer, tmp_path: Path
 ) -> None:
@@ -282,8 +287,8 @@ def test_a_policys_episodes_are_judged_at_their_end_and_a_judge_that_is_down_pau
             result = probe.finish(probe.send(client, Train.Goal(updates=1)))
             assert (result.termination_reason, result.message) == (Train.Result.FINISHED, "")
             wait_until("transitions", lambda: len(transitions) > config.ppo.num_steps)  # and that of the reset
-            steps = {step.step_id: step for step in transitions if any(step.valid)}
-            wait_until("rewards", lambda: len(rewards) == len(steps))
+            wait_until("rewards", lambda: {reward.step_id for reward in rewards} == _made(transitions).keys())
+            steps = _made(transitions)
             ended = {
                 (number, env): step.episode_id[env]
                 for number, step in steps.items()
