@@ -41,7 +41,7 @@ def measure_simulator(config: RunConfig, effort: Effort, model: Path, starts: Pa
     """imagined_steps_per_s: imagined_contender's, 64 environments, a torch thread per core;
     imagined_over_simulator: over those of our scene in ManiSkill with rendering and rule reward, a process per core.
     imagined_over_stock_simulator: over those of ManiSkill's own task with its own reward, as installed, two cameras of
-    the same size and as much time per step. Resets are not counted on any side."""
+    the same size and as much time per step. Resets are not counted, but in rollouts of imagined_contender."""
     cores = sorted(os.sched_getaffinity(0))
     kinds, missing = simulator_kinds(config)
     if missing:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from wm_nodes.core.differences import Differences
 from wm_nodes.core.specs import EnvironmentSpec
-from wm_nodes.world_model.state_change import StateChange
+from wm_nodes.world_model.state_change import ScaledChange, StateChange
 
 
 def state_sizes(spec: EnvironmentSpec) -> dict[str, Any]:
@@ -19,7 +19,7 @@ def state_sizes(spec: EnvironmentSpec) -> dict[str, Any]:
     return {"measured": spec.measured, "differences": spec.differences}
 
 
-class StateModel(nn.Module):
+class StateModel(ScaledChange):
     """The state after a step, from the two before it and what is commanded, and the done signal of a state.
 
     Args:
@@ -37,7 +37,7 @@ class StateModel(nn.Module):
         self, state_dim: int, measured: tuple[int, ...], differences: Sequence[tuple[int, int]], num_tasks: int,
         num_heads: int,
     ) -> None:
-        super().__init__()
+        super().__init__(state_dim, measured, state_dim)
         if not measured:
             raise ValueError("world_model.state_model_iterations needs a state that says where things are, and all of "
                              "this one is commanded; set simulation.object_state, or record what is measured")
@@ -46,21 +46,6 @@ class StateModel(nn.Module):
         self.num_heads = num_heads
         self.read = _network(self.seen.dim + 2 * state_dim, self.HIDDEN, 3, len(measured))
         self.done = nn.ModuleList(_network(self.seen.dim, self.DONE_HIDDEN, 2, num_tasks) for _ in range(num_heads))
-        self.state_mean: Tensor
-        self.state_scale: Tensor
-        self.change_scale: Tensor
-        self.register_buffer("state_mean", torch.zeros(state_dim))
-        self.register_buffer("state_scale", torch.ones(state_dim))
-        self.register_buffer("change_scale", torch.ones(state_dim))
-        self.columns: Tensor
-        self.register_buffer("columns", torch.tensor(measured), persistent=False)  # a captured step may not copy it up
-
-    @torch.no_grad()
-    def fit_scale(self, states_FP: Tensor, changes_FP: Tensor) -> None:
-        """Set shift and scale from recorded states (F, P) and their changes (F, P), before any training."""
-        self.state_mean.copy_(states_FP.mean(0))
-        self.state_scale.copy_(states_FP.std(0, correction=0).clamp_min(1e-3))
-        self.change_scale.copy_(changes_FP.std(0, correction=0).clamp_min(1e-4))
 
     def change(self, states_P: Tensor, earlier_P: Tensor, commanded_P: Tensor) -> Tensor:
         """Change (..., M) of the measured values, in multiples of change_scale. earlier_P: states a step before; at the
@@ -74,7 +59,7 @@ class StateModel(nn.Module):
     def next_states(self, states_P: Tensor, earlier_P: Tensor, commanded_P: Tensor) -> Tensor:
         """States (..., P) after the step: commanded_P with the measured values that are predicted."""
         change = self.change(states_P, earlier_P, commanded_P) * self.change_scale[self.columns]
-        return commanded_P.index_copy(-1, self.columns, states_P[..., self.columns] + change)
+        return self.moved(states_P, change, commanded_P)
 
     def done_logits(self, states_P: Tensor) -> Tensor:
         """(..., K, J), of the states."""

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 from wm_nodes.core.seeding import numpy_stream, torch_stream
 from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.state_model import StateModel
-from wm_nodes.world_model.training.done import bootstrap_masks, done_losses
+from wm_nodes.world_model.training.done import bootstrap_masks, done_losses, done_mask
 from wm_nodes.world_model.training.latent_episodes import LatentEpisodes, first_frames, tool_moves
 
 BATCH, STEPS = 256, 8
@@ -49,7 +49,7 @@ def train_state_model(
             off = (now - states[:, t + 2])[:, columns] / scale
             errors.append(F.huber_loss(off, torch.zeros_like(off), delta=DELTA, reduction="none").mean(-1) / DELTA)
         change = (torch.stack(errors, 1) * recorded).sum() / recorded.sum().clamp_min(1)
-        mask = recorded[:, :, None, None] * heads[rows][:, None, :, None] * data.labelled[rows][:, None, None]
+        mask = done_mask(data, index[:, 0], recorded, heads[index[:, 0]])
         labels = data.success[index, frames[:, 2:]].float()
         done = done_losses(model.done_logits(states[:, 2:]), labels, mask)
         return {"loss": change + done, "change": change, "done": done}
