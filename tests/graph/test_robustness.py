@@ -59,6 +59,18 @@ def test_an_environment_cleaned_up_and_configured_again_has_a_new_session_and_tr
     toy.assert_trained_in_one_process(graph.folder / "policies" / "policy_000003.safetensors", updates=2)
 
 
+def test_a_node_says_at_once_that_it_has_stopped_and_that_its_topics_are_new(graph: Graph, probe: Probe) -> None:
+    heard = probe.listen("run/links")
+    graph.start_environment()
+    wait_until("active", lambda: any(links.active for links in heard))
+    cycle(probe, "environment")
+    first = next(i for i, links in enumerate(heard) if links.active)
+    wait_until("a new session", lambda: heard[-1].session != heard[first].session)
+    said = [(links.session, links.active) for links in heard[first:]]
+    told = [one for one, before in zip(said, [None, *said], strict=False) if one != before]
+    assert [active for _, active in told][:2] == [True, False] and told[-1][1]
+
+
 @pytest.mark.parametrize(
     ("factory", "code", "words"),
     [

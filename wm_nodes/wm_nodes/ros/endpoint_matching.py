@@ -16,19 +16,19 @@ from rclpy.node import Node
 
 from wm_msgs.msg import ErrorCode, NodeLinks
 from wm_nodes.core.errors import WireError
-from wm_nodes.ros.guard import check_sender, nodes_of
+from wm_nodes.ros.guard import check_sender, node_of
 from wm_nodes.ros.publishing import StampedPublisher
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.worker import Work
 
-Ends = Callable[[str], set[str]]
-"""Topic name to the nodes (fully qualified) whose end of it is known."""
+Ends = Callable[[str], set[tuple[str, bytes]]]
+"""Topic name to the ends of it that are known: node (fully qualified) and DDS identifier."""
 
 
 @dataclass(frozen=True)
 class _Peer:
     session: int
-    """Of the node."""
+    """Of the node; another one after each configuration, which makes its topics anew."""
     active: bool
     """Whether it is active."""
     publishes: frozenset[str]
@@ -44,16 +44,20 @@ class EndpointTable:
 
     Args:
         own_name: fully qualified name of this node.
-        session: of this node.
     """
 
-    def __init__(self, own_name: str, session: int) -> None:
-        self._own_name, self._session = own_name, session
+    def __init__(self, own_name: str) -> None:
+        self._own_name = own_name
         self._lock = threading.Lock()
+        self._sessions = dict[str, int]()
+        self._ends = dict[str, set[bytes]]()
+        """Of the peers that were linked: by which ends, under their last session."""
+        self._stale = dict[str, set[bytes]]()
+        """The same of the session before: discovery may list them although they are gone."""
         self._peers: dict[str, _Peer] = {}
         self._ever: set[str] = set()
         self._lost: set[str] = set()
-        self._own = _Peer(session, False, frozenset(), frozenset(), frozenset())
+        self._own = _Peer(0, False, frozenset(), frozenset(), frozenset())
 
     def note(self, message: NodeLinks) -> None:
         """Take in what another node says. Raises WireError where its lists differ in length."""
@@ -68,6 +72,10 @@ class EndpointTable:
         with self._lock:
             self._ever.add(message.node)
             self._lost.discard(message.node)
+            if self._sessions.get(message.node) != message.session:
+                self._sessions[message.node] = message.session
+                if ends := self._ends.pop(message.node, None):
+                    self._stale[message.node] = ends
             self._peers[message.node] = _Peer(
                 message.session, message.active, frozenset(message.publishes), frozenset(message.subscribes), linked
             )
@@ -83,13 +91,15 @@ class EndpointTable:
                 self._lost.add(name)
 
     def refresh(
-        self, publishes: Collection[str], subscribes: Collection[str], active: bool, readers: Ends, writers: Ends
+        self, session: int, publishes: Collection[str], subscribes: Collection[str], active: bool, readers: Ends,
+        writers: Ends,
     ) -> bool:
         """Look at the graph again; return whether this node's announcement has changed.
 
         Args:
+            session: of this node.
             publishes, subscribes: this node's topics, absolute.
-            readers, writers: the nodes whose subscription to, or publisher of, a topic this node has discovered.
+            readers, writers: the subscriptions to, or publishers of, a topic that this node has discovered.
         """
         outgoing, incoming = frozenset(publishes), frozenset(subscribes)
         with self._lock:
@@ -100,12 +110,16 @@ class EndpointTable:
             key = (name, peer.session)
             if not peer.active:
                 continue
-            if (same and key in self._own.linked) or (
-                all(name in readers(topic) for topic in outgoing & peer.subscribes)
-                and all(name in writers(topic) for topic in incoming & peer.publishes)
-            ):
+            if same and key in self._own.linked:
                 linked.add(key)
-        mine = _Peer(self._session, active, outgoing, incoming, frozenset(linked))
+                continue
+            gone = self._stale.get(name, set())
+            known = [{end for node, end in ends(topic) if node == name} - gone for ends, shared in (
+                (readers, outgoing & peer.subscribes), (writers, incoming & peer.publishes)) for topic in shared]
+            if all(known):
+                linked.add(key)
+                self._ends[name] = set[bytes]().union(*known)
+        mine = _Peer(session, active, outgoing, incoming, frozenset(linked))
         changed = mine != self._own
         with self._lock:
             self._own = mine
@@ -115,7 +129,7 @@ class EndpointTable:
         """What this node knows of itself since the last refresh()."""
         mine, names = self._own, sorted(self._own.linked)
         return NodeLinks(
-            session=self._session, node=self._own_name, active=mine.active, publishes=sorted(mine.publishes),
+            session=mine.session, node=self._own_name, active=mine.active, publishes=sorted(mine.publishes),
             subscribes=sorted(mine.subscribes), linked=[name for name, _ in names],
             linked_sessions=[session for _, session in names],
         )
@@ -144,14 +158,14 @@ class Links:
     """The part of a node that keeps its EndpointTable and talks on run/links.
 
     Args:
-        session: of the node.
+        session: of the node, as it is now.
         is_active: whether the node is active.
     """
 
-    def __init__(self, node: Node, session: int, is_active: Callable[[], bool]) -> None:
-        self._node, self._is_active = node, is_active
-        self.table = EndpointTable(node.get_fully_qualified_name(), session)
-        self._publisher = StampedPublisher(node, "run/links", session)
+    def __init__(self, node: Node, session: Callable[[], int], is_active: Callable[[], bool]) -> None:
+        self._node, self._session, self._is_active = node, session, is_active
+        self.table = EndpointTable(node.get_fully_qualified_name())
+        self._publisher = StampedPublisher(node, "run/links", session())
         row = topic("run/links")
         self._subscription = node.create_subscription(row.type, row.name, self._on_links, row.reader_qos)
 
@@ -159,14 +173,15 @@ class Links:
         """Tell the others when this node has come to see more, or less, of them; again: in any case."""
         node = self._node
         changed = self.table.refresh(
-            {publisher.topic_name for publisher in node.publishers},
+            self._session(), {publisher.topic_name for publisher in node.publishers},
             {subscription.topic_name for subscription in node.subscriptions}, self._is_active(),
-            lambda name: nodes_of(node.get_subscriptions_info_by_topic(name)),
-            lambda name: nodes_of(node.get_publishers_info_by_topic(name)),
+            lambda name: _ends_of(node.get_subscriptions_info_by_topic(name)),
+            lambda name: _ends_of(node.get_publishers_info_by_topic(name)),
         )
         if changed or again:
             message = self.table.announcement()
             message.header.stamp = node.get_clock().now().to_msg()
+            self._publisher.enter(message.session)
             self._publisher.publish(message)
 
     def _on_links(self, message: NodeLinks) -> None:
@@ -174,6 +189,10 @@ class Links:
             check_sender(self._node, "run/links", message.node)
         self.table.note(message)
         self.announce()
+
+
+def _ends_of(ends: Iterable[Any]) -> set[tuple[str, bytes]]:
+    return {(node_of(end), bytes(end.endpoint_gid)) for end in ends}
 
 
 class StartBarrier:

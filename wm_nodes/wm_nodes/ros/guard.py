@@ -118,7 +118,11 @@ def check_sender(node: Any, topic_name: str, name: str) -> None:
 
 def nodes_of(ends: Iterable[Any]) -> set[str]:
     """The fully qualified names of the nodes that ends of a topic belong to."""
-    return {f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends}
+    return {node_of(end) for end in ends}
+
+
+def node_of(end: Any) -> str:
+    return f"{end.node_namespace.rstrip('/')}/{end.node_name}"
 
 
 def _describe(error: Exception, *, where: bool) -> str:

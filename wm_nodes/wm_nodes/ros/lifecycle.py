@@ -75,7 +75,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             lambda: self.get_clock().now().to_msg(), run_dir,
         )
         self._heartbeat = Heartbeat(self)
-        self.links = Links(self, self.session, lambda: self._active)
+        self.links = Links(self, lambda: self.session, lambda: self._active)
         self._heartbeat_timer = self.create_timer(HEARTBEAT_S, self._on_heartbeat, clock=steady)
         self._diagnostics_timer = self.create_timer(1.0, self._on_diagnostics, clock=steady)
 
@@ -279,6 +279,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         if result != TransitionCallbackReturn.SUCCESS:
             self._active = False
             return result
+        self.links.announce()
         self.get_logger().info("active")
         return super().on_activate(state)
 
@@ -286,6 +287,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         result = self._attempt("deactivate", lambda: self.deactivate("deactivated"))
         if result == TransitionCallbackReturn.SUCCESS:
             self._active = False
+            self.links.announce()
         return result
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:

@@ -20,6 +20,11 @@ class StampedPublisher:
         self.publisher = node.create_publisher(row.type, row.name, qos or row.qos)
         self._session, self.next_seq = session, 0
 
+    def enter(self, session: int) -> None:
+        """Number from 0 again where the session is another one."""
+        if session != self._session:
+            self._session, self.next_seq = session, 0
+
     def publish(self, message: Any) -> None:
         message.session, message.seq = self._session, self.next_seq
         self.next_seq += 1
