@@ -104,11 +104,19 @@ def test_a_model_of_states_learns_a_push_and_its_success(monkeypatch: pytest.Mon
     with torch.no_grad():
         for t in range(steps):
             earlier, now = now, model.next_states(now, earlier, states[:, t + 1])
-        signal, _ = done_signal(model.done_logits(now))
+        signal, _ = done_signal(model.done_logits(now, earlier))
     errors = (now - states[:, -1])[:, 2].abs()
     travelled = (states[:, -1] - states[:, 0])[moved, 2].mean()
     assert errors[~moved].mean() < 0.005 and errors[moved].mean() < 0.25 * travelled
     assert ((signal > 0.5) == won[:, -1]).float().mean() > 0.9
+
+
+def test_the_done_signal_sees_whether_things_still_move_but_not_how_the_tool_came() -> None:
+    torch.manual_seed(0)
+    model, now = StateModel(4, (2, 3), ((0, 2), (1, 3)), num_tasks=1, num_heads=2), torch.zeros(1, 4)
+    at_rest, fell, tool_moved = (model.done_logits(now, now + torch.tensor([change])) for change in (
+        [0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.5], [0.5, 0.0, 0.0, 0.0]))
+    assert not torch.equal(fell, at_rest) and torch.equal(tool_moved, at_rest)
 
 
 def told_models(config: RunConfig, path: Path) -> tuple[WorldModels, tuple[np.ndarray, np.ndarray]]:

@@ -170,12 +170,12 @@ class ActionModel(FrameModel):
         caches: Caches | None = None,
     ) -> Prediction:
         condition = self.condition(actions_BTA, states_BTP, next_states_BTP)
-        return self.predict(latents_BTSD, condition, caches, told_BTKJ=self.told(next_states_BTP))
+        return self.predict(latents_BTSD, condition, caches, told_BTKJ=self.told(next_states_BTP, states_BTP))
 
     @torch.no_grad()
-    def told(self, states_BTP: Tensor) -> Tensor | None:
-        """Done logits of the states; None: the done heads read them off the picture."""
-        return None if self.state_model is None else self.state_model.done_logits(states_BTP)
+    def told(self, states_BTP: Tensor, earlier_BTP: Tensor) -> Tensor | None:
+        """Done logits of the states, with those of a step before; None: the done heads read them off the picture."""
+        return None if self.state_model is None else self.state_model.done_logits(states_BTP, earlier_BTP)
 
     def advance(
         self, latents_NSD: Tensor, actions_NA: Tensor, states_NP: Tensor, next_states_NP: Tensor,

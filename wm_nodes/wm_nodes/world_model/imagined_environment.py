@@ -218,7 +218,8 @@ class DeviceEnvironment(DeviceEpisodes):
     def _told(self, model: ActionModel | TokenActionModel, moved_NP: Tensor) -> Tensor:
         """Done logits (N, K, J) by the states alone."""
         assert model.state_model is not None  # see pictures
-        return model.state_model.done_logits(moved_NP[:, : self.spec.tool_dim])
+        moved, before = (states[:, : self.spec.tool_dim] for states in (moved_NP, self.states_NP))
+        return model.state_model.done_logits(moved, before)
 
     @staticmethod
     def _agreed(logits: Sequence[Tensor], tasks_N: Tensor) -> tuple[Tensor, Tensor]:

@@ -45,15 +45,16 @@ class StateModel(ScaledChange):
         self.lengths = tuple(i for i in measured if any(i in pair for pair in differences))
         self.num_heads = num_heads
         self.read = _network(self.seen.dim + 2 * state_dim, self.HIDDEN, 3, len(measured))
-        self.done = nn.ModuleList(_network(self.seen.dim, self.DONE_HIDDEN, 2, num_tasks) for _ in range(num_heads))
+        seen = self.seen.dim + len(measured)
+        self.done = nn.ModuleList(_network(seen, self.DONE_HIDDEN, 2, num_tasks) for _ in range(num_heads))
 
     def change(self, states_P: Tensor, earlier_P: Tensor, commanded_P: Tensor) -> Tensor:
         """Change (..., M) of the measured values, in multiples of change_scale. earlier_P: states a step before; at the
         start the same. commanded_P: states after the step, of which the commanded values count."""
         with torch.autocast(states_P.device.type, enabled=False):
             wanted = (commanded_P - states_P).index_fill(-1, self.columns, 0.0)
-            moves = torch.cat((wanted, states_P - earlier_P), -1) / torch.cat((self.change_scale, self.change_scale))
-            found: Tensor = self.read(torch.cat((self._scaled(states_P), moves.clamp(-self.MOST, self.MOST)), -1))
+            seen = self._scaled(states_P), self._moves(wanted), self._moves(states_P - earlier_P)
+            found: Tensor = self.read(torch.cat(seen, -1))
             return found
 
     def next_states(self, states_P: Tensor, earlier_P: Tensor, commanded_P: Tensor) -> Tensor:
@@ -61,11 +62,16 @@ class StateModel(ScaledChange):
         change = self.change(states_P, earlier_P, commanded_P) * self.change_scale[self.columns]
         return self.moved(states_P, change, commanded_P)
 
-    def done_logits(self, states_P: Tensor) -> Tensor:
-        """(..., K, J), of the states."""
+    def done_logits(self, states_P: Tensor, earlier_P: Tensor) -> Tensor:
+        """(..., K, J), of the states; earlier_P: a step before, so that what still moves is not taken
+        for at rest."""
         with torch.autocast(states_P.device.type, enabled=False):
-            scaled = self._scaled(states_P)
-            return torch.stack([head(scaled) for head in self.done], -2)
+            moved = self._moves(states_P - earlier_P)[..., self.columns]
+            seen = torch.cat((self._scaled(states_P), moved), -1)
+            return torch.stack([head(seen) for head in self.done], -2)
+
+    def _moves(self, change_P: Tensor) -> Tensor:
+        return (change_P / self.change_scale).clamp(-self.MOST, self.MOST)
 
     def _scaled(self, states_P: Tensor) -> Tensor:
         seen: Tensor = self.seen((states_P - self.state_mean) / self.state_scale, states_P)

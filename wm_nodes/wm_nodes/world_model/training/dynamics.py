@@ -179,7 +179,7 @@ def unroll(
     real = data.latents[index].float()
     states, actions = data.states[index], data.actions[index]
     noisy = tokenizer.normalise(real[:, :-1] + INPUT_NOISE * noise)
-    condition, told = model.condition(actions, states[:, :-1], states[:, 1:]), model.told(states[:, 1:])
+    condition, told = model.condition(actions, states[:, :-1], states[:, 1:]), model.told(states[:, 1:], states[:, :-1])
     if one_pass:
         prediction = model.predict(noisy, condition, told_BTKJ=told)
         one_step = tokenizer.normalise(noisy + prediction.change_BTSD)

@@ -51,7 +51,7 @@ def train_state_model(
         change = (torch.stack(errors, 1) * recorded).sum() / recorded.sum().clamp_min(1)
         mask = done_mask(data, index[:, 0], recorded, heads[index[:, 0]])
         labels = data.success[index, frames[:, 2:]].float()
-        done = done_losses(model.done_logits(states[:, 2:]), labels, mask)
+        done = done_losses(model.done_logits(states[:, 2:], states[:, 1:-1]), labels, mask)
         return {"loss": change + done, "change": change, "done": done}
 
     return TrainingLoop("state_model", model, num_iterations, LEARNING_RATE, run_dir).run(loss)
