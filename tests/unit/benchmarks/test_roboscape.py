@@ -1,6 +1,7 @@
 """Table 1 of RoboScape-R: its formula on the paper's own cells, its cells, and every kind of training end to end."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,8 @@ import cv2
 import pytest
 from model_folders import make_model_folder
 
+from benchmarks.environments import roboscape
+from benchmarks.environments.policies import Workplace, train_on
 from benchmarks.environments.roboscape import (
     ALL_SCENES,
     JUDGE,
@@ -28,6 +31,7 @@ from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
 from wm_nodes.config.scenes import splits
 from wm_nodes.config.tasks import part_of
+from wm_nodes.policy_rl.image_policy import ImagePolicy
 
 
 def row(task: str, training: str, seed: int, ind: float, ood: float, **more: object) -> dict[str, Any]:
@@ -75,9 +79,17 @@ def test_the_demonstrations_of_a_seed_are_of_one_training_scene() -> None:
 @pytest.mark.slow
 @pytest.mark.rendering
 def test_every_training_is_made_once_and_measured_in_and_out_of_domain(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    noises = list[float | None]()
+
+    def train(workplace: Workplace, policy: ImagePolicy, imagined: Any, *arguments: Any) -> Iterator[float]:
+        noises.append(getattr(imagined, "picture_noise", None))
+        return train_on(workplace, policy, imagined, *arguments)
+
+    monkeypatch.setattr(roboscape, "train_on", train)
     short = {"simulation.max_episode_steps": 20, "evaluation.episodes": 1, "acceptance.num_episodes": 2,
+             "imagined_environment.picture_noise": 0.01,
              "acceptance.clone_episodes": 2, "data.num_workers": 1, "sft.num_demonstrations": 1, "ppo.updates": 1,
              "tokenizer.foreground": "background", "ppo.num_steps": 20, "model_refresh.episodes_per_round": 1,
              "model_refresh.heldout_episodes": 2, "model_refresh.replay_episodes": 1,
@@ -89,6 +101,7 @@ def test_every_training_is_made_once_and_measured_in_and_out_of_domain(
              "--trainings", SFT, ONE_SCENE, ALL_SCENES, MODEL, JUDGE, REFRESHED,
              *(word for name, value in short.items() for word in (f"--{name}", str(value)))]
     assert main(words) == 0
+    assert noises == [None, None, 0.01, 0.01]
     rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
     assert [one["model"] for one in rows] == [SFT, ONE_SCENE, ALL_SCENES, MODEL, JUDGE, REFRESHED]
     assert all(one["success"].keys() == {scene_of_seed(0), *OOD} for one in rows)

@@ -189,8 +189,8 @@ def _cell(
     if training == REFRESHED:
         workplace, refresh = _refreshed(workplace)
     if training in IN_MODEL:
-        imagined = workplace.environment(WORLD_MODEL)
-        before = workplace.imagined(policy, imagined)
+        imagined = workplace.environment(WORLD_MODEL, training=True)
+        before = workplace.imagined(policy, workplace.environment(WORLD_MODEL))
         report = workplace.acceptance(WORLD_MODEL, policy, before, workplace.real(policy, TRAIN))
     if training in LEARNED:
         imagined = environment_paid_by(LEARNED[training], workplace, learned_from, work)
