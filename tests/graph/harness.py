@@ -142,7 +142,7 @@ class Probe:
     def links(self) -> EndpointTable:
         """A book of what the nodes say of their links from now on; a node restarted before it was reported as lost is
         in use again only when the others have matched its new session."""
-        book, row = EndpointTable(self.node.get_fully_qualified_name(), 0), topic("run/links")
+        book, row = EndpointTable(self.node.get_fully_qualified_name()), topic("run/links")
 
         def hear(message: Any) -> None:
             with contextlib.suppress(WireError):
