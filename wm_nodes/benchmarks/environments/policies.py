@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -74,11 +74,9 @@ class Workplace:
         """The policy of a file; None: the one that training begins with."""
         return load_policy(self.config, self.model_dir, weights or self.start[1])
 
-    def environment(self, model: str, num_envs: int = 0, *, training: bool = False) -> ImaginedEpisodes:
-        """model: WORLD_MODEL, or a video model's folder. num_envs: 0 for the configuration's. training: as
-        make_imagined_environment's."""
-        world = partial(make_imagined_environment, training=training)
-        make = world if model == WORLD_MODEL else make_video_environment
+    def environment(self, model: str, num_envs: int = 0) -> ImaginedEpisodes:
+        """model: WORLD_MODEL, or a video model's folder. num_envs: 0 for the configuration's."""
+        make = make_imagined_environment if model == WORLD_MODEL else make_video_environment
         folder = self.model_dir if model == WORLD_MODEL else Path(model)
         count = num_envs or self.config.ppo.num_envs
         return make(self.config, folder, self.start[0], num_envs=count, seed=self.config.seed)

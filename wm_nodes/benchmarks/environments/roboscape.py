@@ -36,7 +36,7 @@ from wm_nodes.core.statistics import t_interval
 from wm_nodes.policy_rl.model_refresh import RefreshDecision, refresh_round, round_folder
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.training.weights import save_weights
-from wm_nodes.world_model import ImaginedEpisodes
+from wm_nodes.world_model import ImaginedEnvironment, ImaginedEpisodes
 from wm_nodes.world_model.folder import read_world_manifest
 
 TASKS = ("pick_place", "push", "pull", "move_to_aim")
@@ -189,9 +189,11 @@ def _cell(
     if training == REFRESHED:
         workplace, refresh = _refreshed(workplace)
     if training in IN_MODEL:
-        imagined = workplace.environment(WORLD_MODEL, training=True)
-        before = workplace.imagined(policy, workplace.environment(WORLD_MODEL))
+        imagined = workplace.environment(WORLD_MODEL)
+        before = workplace.imagined(policy, imagined)
         report = workplace.acceptance(WORLD_MODEL, policy, before, workplace.real(policy, TRAIN))
+        assert isinstance(imagined, ImaginedEnvironment)
+        imagined.picture_noise = config.imagined_environment.picture_noise  # while it is trained in
     if training in LEARNED:
         imagined = environment_paid_by(LEARNED[training], workplace, learned_from, work)
     course = list[float]()

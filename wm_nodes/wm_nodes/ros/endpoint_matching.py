@@ -49,11 +49,9 @@ class EndpointTable:
     def __init__(self, own_name: str) -> None:
         self._own_name = own_name
         self._lock = threading.Lock()
-        self._sessions = dict[str, int]()
-        self._ends = dict[str, set[bytes]]()
-        """Of the peers that were linked: by which ends, under their last session."""
-        self._stale = dict[str, set[bytes]]()
-        """The same of the session before: discovery may list them although they are gone."""
+        self._ends = dict[str, tuple[int, set[bytes], set[bytes]]]()
+        """Of the peers that were linked: session, by which ends, and those of the session before, which discovery may
+        list although they are gone."""
         self._peers: dict[str, _Peer] = {}
         self._ever: set[str] = set()
         self._lost: set[str] = set()
@@ -72,10 +70,6 @@ class EndpointTable:
         with self._lock:
             self._ever.add(message.node)
             self._lost.discard(message.node)
-            if self._sessions.get(message.node) != message.session:
-                self._sessions[message.node] = message.session
-                if ends := self._ends.pop(message.node, None):
-                    self._stale[message.node] = ends
             self._peers[message.node] = _Peer(
                 message.session, message.active, frozenset(message.publishes), frozenset(message.subscribes), linked
             )
@@ -113,12 +107,14 @@ class EndpointTable:
             if same and key in self._own.linked:
                 linked.add(key)
                 continue
-            gone = self._stale.get(name, set())
+            session_before, ends_before, gone = self._ends.get(name, (peer.session, set[bytes](), set[bytes]()))
+            if session_before != peer.session:
+                gone = ends_before or gone
             known = [{end for node, end in ends(topic) if node == name} - gone for ends, shared in (
                 (readers, outgoing & peer.subscribes), (writers, incoming & peer.publishes)) for topic in shared]
             if all(known):
                 linked.add(key)
-                self._ends[name] = set[bytes]().union(*known)
+                self._ends[name] = peer.session, set[bytes]().union(*known), gone
         mine = _Peer(session, active, outgoing, incoming, frozenset(linked))
         changed = mine != self._own
         with self._lock:

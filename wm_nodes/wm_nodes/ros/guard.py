@@ -122,6 +122,7 @@ def nodes_of(ends: Iterable[Any]) -> set[str]:
 
 
 def node_of(end: Any) -> str:
+    """The fully qualified name of the node that an end of a topic belongs to."""
     return f"{end.node_namespace.rstrip('/')}/{end.node_name}"
 
 
