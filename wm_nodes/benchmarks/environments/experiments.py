@@ -24,6 +24,7 @@ from benchmarks.environments.policies import (
 from benchmarks.experiment import Experiment, console
 from wm_nodes.apps import options
 from wm_nodes.config.load import load_config
+from wm_nodes.config.object_state import with_reader
 from wm_nodes.config.scenes import check_scenes
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
@@ -175,6 +176,7 @@ class Measured(Configured):
 
     def _measured(self, config: RunConfig) -> dict[str, Any]:
         how, model = config.evaluation, self.model_dir
+        config = with_reader(config, model)
         policy = load_policy(config, model, self.weights) if self.weights else make_policy(config, model)
         with (
             closing(make_environment(config, how.environment, num_envs=SIMULATOR_ENVS, seed=config.seed)) as env,

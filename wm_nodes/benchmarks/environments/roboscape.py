@@ -27,6 +27,7 @@ from benchmarks.environments.policies import (
 from benchmarks.environments.reward_test import measure_rewards, rewards_table
 from benchmarks.experiment import Count, console
 from wm_nodes.config.load import load_config
+from wm_nodes.config.object_state import with_reader
 from wm_nodes.config.scenes import draw, splits
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import part_of, parts_of
@@ -148,8 +149,8 @@ class RoboScape(Configured):
     def _test_model(self) -> None:
         shown, of_rewards = list[dict[str, Any]](), self.figure == "3"
         for task in tqdm(self.columns, desc="tasks", unit="task"):
-            config = load_config(self.preset, {**self.settings, "task": task})
             folder = self.model_dir or shipped_model(task)
+            config = with_reader(load_config(self.preset, {**self.settings, "task": task}), folder)
             wanted: dict[str, Any] = {
                 "config": config.model_dump(mode="json"),
                 "world_model_sha256": files_sha256(read_world_manifest(folder)),

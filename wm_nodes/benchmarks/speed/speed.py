@@ -18,6 +18,7 @@ from benchmarks.speed.simulator import IMAGINED_ENVS, measure_simulator
 from benchmarks.speed.stages import measure_stages
 from wm_nodes.apps import options
 from wm_nodes.config.load import load_config
+from wm_nodes.config.object_state import with_reader
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.memory import keep_freed_memory
 from wm_nodes.reports.console_table import make_table
@@ -80,6 +81,7 @@ def measure(config: RunConfig, effort: Effort, folder: Path, model_dir: Path | N
     keep_freed_memory()
     torch.set_num_threads(len(os.sched_getaffinity(0)))
     model, starts, description = prepare_model(config, folder, model_dir)
+    config = with_reader(config, model)
     console.print(f"world model: {description}; {torch.get_num_threads()} torch threads", highlight=False)
     results: dict[str, Any] = {"model": description, "torch_threads": torch.get_num_threads()}
     results |= measure_graph(config, effort, folder, model, starts)

@@ -25,6 +25,7 @@ from wm_nodes.config.load import (
     reward_overrides,
     with_judge,
 )
+from wm_nodes.config.object_state import with_reader
 from wm_nodes.config.schema import AGENT, EXECUTION, RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT, MODEL_EPISODES
 from wm_nodes.config.shipped import shipped_model
@@ -102,8 +103,9 @@ def opened(arguments: argparse.Namespace) -> AbstractContextManager[tuple[VideoR
 def _run(arguments: argparse.Namespace, config: VideoRlConfig, run_dir: Path) -> None:
     stage = Stages()
     stage(f"run folder {run_dir}")
-    scene = load_config("cpu", {"task": config.task, "seed": config.seed})
-    probe = load_probe(shipped_model(config.task), compute_device(config.device))
+    shipped_world = shipped_model(config.task)
+    scene = with_reader(load_config("cpu", {"task": config.task, "seed": config.seed}), shipped_world)
+    probe = load_probe(shipped_world, compute_device(config.device))
     shipped = None if arguments.from_scratch else shipped_video_model(config)
     if arguments.bags:
         stage(f"{len(arguments.bags)} + {len(arguments.heldout_bags)} held-out recordings")

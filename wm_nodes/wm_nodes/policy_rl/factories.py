@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
+from wm_nodes.config.object_state import with_reader
 from wm_nodes.config.schema import PolicyInputs, RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import has_simulator
@@ -92,7 +93,7 @@ def run_spec(config: RunConfig, model_dir: Path) -> EnvironmentSpec:
     """The environment of a run: of the configured task in its simulator, or where it has none the one that the world
     model was trained with. Raises ModelFolderError: the folder says none."""
     if has_simulator(config.task):
-        return configured_spec(config)
+        return configured_spec(with_reader(config, model_dir))
     return model_spec(model_dir, read_world_manifest(model_dir))
 
 

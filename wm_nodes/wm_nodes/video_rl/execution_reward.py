@@ -179,7 +179,7 @@ class ExecutionReward:
 def check_followable(spec: EnvironmentSpec, recordings: Clips) -> None:
     """Raise ValueError unless a tool path says what an environment is commanded by to do what was recorded."""
     pose = moves_pose(spec)
-    commanded = spec.action_dim == spec.tool_dim and not spec.measured
+    commanded = [i for i in range(spec.tool_dim) if i not in spec.measured] == [*range(spec.action_dim)]
     if not commanded or len(columns_of(recordings.task, "tool")) != 3 or not (pose or spec.action_dim == 3):
         raise ValueError(
             f"the reward execution follows a tool's place in three coordinates, and {spec.env_id} is commanded by "

@@ -111,6 +111,9 @@ def test_too_few_too_short_or_too_small_recordings_are_refused() -> None:
     small = replace(episodes()[0], images=episodes()[0].images[:, :32])
     with pytest.raises(ValueError, match="pictures of 32 x 128 px, the world model sees 64 x 128 px"):
         calibrate(models(), [small], stride=1, seed=0)
+    narrow = replace(episodes()[0], states=episodes()[0].states[:, :2])
+    with pytest.raises(ValueError, match=r"states of 2 values, the world model knows 3 \(tool_target_x, .*wm collect"):
+        calibrate(models(), [narrow], stride=1, seed=0)
 
 
 def test_a_task_counts_as_done_by_its_own_rule_in_recordings_of_its_scene() -> None:

@@ -50,7 +50,8 @@ def calibrate(
         moving: names of the cameras that move; in the pictures of the others the scenery stays.
 
     Raises:
-        ValueError: too few recordings, pictures of another size than the model's, or as model_numbers.
+        ValueError: too few recordings, pictures of another size than the model's, states that lack values of its
+                own, or as model_numbers.
     """
     recorded = [episode for episode in episodes if episode.num_steps >= stride * (SHORTEST - 1)]
     _check_sizes(models, recorded)
@@ -153,14 +154,20 @@ def harmless(frames: UInt8Array, rng: np.random.Generator) -> UInt8Array:
 
 
 def _check_sizes(models: WorldModels, episodes: Sequence[Episode]) -> None:
-    """Raises ValueError: pictures of another size than the model's."""
-    size = models.tokenizer.height, models.tokenizer.width
+    """Raises ValueError: pictures of another size than the model's, or states that lack values of its own."""
+    size, values = (models.tokenizer.height, models.tokenizer.width), models.spec.state_dim
     for episode in episodes:
         if episode.images.shape[1:3] != size:
             height, width = episode.images.shape[1:3]
             raise ValueError(
                 f"an episode has pictures of {height} x {width} px, the world model sees {size[0]} x {size[1]} px; "
                 "name bags in its cameras"
+            )
+        if episode.states.shape[1] < values:
+            raise ValueError(
+                f"an episode has states of {episode.states.shape[1]} values, the world model knows {values} "
+                f"({', '.join(models.spec.state_names)}); name bags of its environment, "
+                "e.g. wm collect --simulation.object_state truth"
             )
 
 
