@@ -59,6 +59,20 @@ def test_the_main_job_stops_at_acceptance_and_when_forced_leaves_summary_report_
     assert main(["rescore", str(run_dir)]) == 0, "the recorded rewards, evaluated again, are others"
 
 
+@pytest.mark.slow
+def test_policies_of_places_that_a_model_reads_off_pictures_are_trained_and_measured(
+    ros_domain: int, tmp_path: Path
+) -> None:
+    done = train_policy([*SMALL, "--task", "push", "--force", "--run-dir", str(tmp_path / "run")], ros_domain)
+    assert done.returncode == 0, done.stdout + done.stderr
+    bag = Path(read_summary(tmp_path / "run")["bag"])
+    simulated, imagined = (list(read_episodes(bag, namespace=name)) for name in ("/wm/sim", "/wm"))
+    assert len(simulated) >= 8 and imagined
+    for episode in (*simulated, *imagined):
+        assert episode.states.shape[1] == 16 and np.isfinite(episode.states).all()
+        assert np.ptp(episode.states[:, 7:], axis=0).any(), "what is read or predicted changes"
+
+
 def write_some_starts(path: Path) -> None:
     """Grey first frames: enough for a model without quality, and no simulator is needed for them."""
     path.parent.mkdir()

@@ -36,7 +36,8 @@ def test_it_is_told_to_stay_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize(
-    "chosen", [{"from_scratch": False}, {"from_scratch": True, "world_model.object_reader_iterations": 0}]
+    "chosen",
+    [{"from_scratch": False, "task": "push_cube"}, {"from_scratch": True, "world_model.object_reader_iterations": 0}],
 )
 def test_a_policy_that_would_see_nothing_is_refused_before_anything_is_collected(chosen: dict[str, Any]) -> None:
     from_scratch = chosen.pop("from_scratch")

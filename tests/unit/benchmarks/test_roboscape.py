@@ -89,7 +89,7 @@ def test_every_training_is_made_once_and_measured_in_and_out_of_domain(
 
     monkeypatch.setattr(roboscape, "train_on", train)
     short = {"simulation.max_episode_steps": 20, "evaluation.episodes": 1, "acceptance.num_episodes": 2,
-             "imagined_environment.picture_noise": 0.01,
+             "imagined_environment.picture_noise": 0.01, "policy.inputs": "latents",
              "acceptance.clone_episodes": 2, "data.num_workers": 1, "sft.num_demonstrations": 1, "ppo.updates": 1,
              "tokenizer.foreground": "background", "ppo.num_steps": 20, "model_refresh.episodes_per_round": 1,
              "model_refresh.heldout_episodes": 2, "model_refresh.replay_episodes": 1,
@@ -97,7 +97,7 @@ def test_every_training_is_made_once_and_measured_in_and_out_of_domain(
     model = make_model_folder(tmp_path / "model", load_config("smoke", {"task": "push", **short}))
     file = tmp_path / "rows.json"
     words = ["reproduce", "roboscape", "--preset", "smoke", "--model-dir", str(model), "--tasks", "push",
-             "--seeds", "0", "--json", str(file), "--work", str(tmp_path / "work"), "--policy.inputs", "latents",
+             "--seeds", "0", "--json", str(file), "--work", str(tmp_path / "work"),
              "--trainings", SFT, ONE_SCENE, ALL_SCENES, MODEL, JUDGE, REFRESHED,
              *(word for name, value in short.items() for word in (f"--{name}", str(value)))]
     assert main(words) == 0

@@ -30,7 +30,7 @@ AT_ONCE = {"reward.success_threshold": 0.0}
 
 
 def made(num_envs: int = N, **arguments: Any) -> VectorEnv:  # type: ignore[type-arg]
-    return gymnasium.make_vec(ID, num_envs, task="push_cube", **{"settings": SHORT, **arguments})
+    return gymnasium.make_vec(ID, num_envs, **{"task": "push_cube", "settings": SHORT, **arguments})
 
 
 @pytest.fixture(scope="module")
@@ -148,6 +148,13 @@ def test_a_model_without_a_state_shows_pictures_alone() -> None:
     assert set(observation_space(replace(unbounded, state_names=(), state_units=()))) == {"image"}
     measured = observation_space(unbounded)["state"]
     assert measured.contains(np.full(3, -1e6, np.float32))
+
+
+def test_a_model_whose_pictures_are_read_shows_the_places_too() -> None:
+    environment = made(2, task="push")
+    names = models_of(shipped_model("push"), "cpu").spec.state_names
+    assert environment.reset(seed=0)[0]["state"].shape == (2, len(names)) and "object_x" in names
+    environment.close()
 
 
 def test_latents_and_positions_are_those_of_the_picture_and_an_episode_s_last_ones_too() -> None:

@@ -202,14 +202,15 @@ def test_a_model_of_other_tasks_and_an_arm_that_a_place_does_not_command_are_ref
 def pose_walks(gripper: float) -> Clips:
     """The same of an arm that is commanded by poses, whose gripper ends at this value."""
     clips, objects = walks(), read_world_manifest(shipped_model("push"))
-    states = np.zeros((*clips.states.shape[:2], 7), np.float32)
+    spec = spec_of_values(objects["spec"])
+    states = np.zeros((*clips.states.shape[:2], spec.tool_dim), np.float32)
     states[..., :3], states[..., 5], states[..., 6] = clips.states, 0.3, -1.0
     states[:, -1, 6] = gripper
     truth = np.zeros((*clips.ground_truth.shape[:2], len(objects["spec"]["ground_truth_names"])), np.float32)
     tool = objects["spec"]["ground_truth_names"].index("tool_x")
     truth[..., tool : tool + 3] = clips.ground_truth[..., TOOL]
     return replace(
-        clips, states=states, ground_truth=truth, task="push", spec=spec_of_values(objects["spec"]),
+        clips, states=states, ground_truth=truth, task="push", spec=spec,
         actions=torch.zeros(len(states), 8, 14),
     )
 
@@ -226,7 +227,7 @@ def test_an_arm_that_is_commanded_by_poses_keeps_its_rotation_and_its_gripper() 
         assert not step.actions_NA[:, 3:6].any() and (step.actions_NA[:, 6] == -1).all()
     reached = steps[-1].arm.states_NP.numpy()
     np.testing.assert_allclose(reached[:, :3], paths[:, -1], atol=1e-3)
-    np.testing.assert_allclose(reached[:, 3:], clips.states[:, 0, 3:], atol=1e-5)
+    np.testing.assert_allclose(reached[:, 3:7], clips.states[:, 0, 3:7], atol=1e-5)
 
 
 def test_a_task_whose_gripper_opens_or_closes_is_refused_before_anything_is_made() -> None:

@@ -203,8 +203,8 @@ def test_what_a_models_manifest_says_stands_in_for_a_measurement() -> None:
     assert accepted_when_made(cube, config).startswith("passed on 150 held-out episodes when it was made")
     scenes = load_config("cpu", {"task": "push"})
     found = accepted_when_made(read_world_manifest(shipped_model("push")), scenes)
-    assert found.startswith("passed on 12 held-out episodes")
-    strict = scenes.with_values(acceptance=scenes.acceptance.with_values(tool_error_ratio=0.1))
+    assert found.startswith("passed on 64 held-out episodes")
+    strict = scenes.with_values(acceptance=scenes.acceptance.with_values(tool_error_ratio=1e-3))
     assert accepted_when_made(read_world_manifest(shipped_model("push")), strict).startswith("failed (tool error")
     assert accepted_when_made({}, config).startswith("not judged: the model's manifest holds no metrics")
 

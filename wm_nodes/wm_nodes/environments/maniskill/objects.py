@@ -40,7 +40,7 @@ SETTINGS = {
     "world_model.latent_weight": 10.0, "sft.num_demonstrations": 400, "tokenizer.foreground": "surroundings",
     "tokenizer.latent_dim": 48, "tokenizer.probe_weight": 1.0, "tokenizer.probe_depth": 2,
     "tokenizer.probe_iterations": 7000, "sft.num_iterations": 3000, "ppo.num_envs": 64, "ppo.num_steps": 40,
-    "ppo.advantage_floor": 0.1, "policy.init_log_std": -3.0, "policy.inputs": "both",
+    "ppo.advantage_floor": 0.1, "policy.init_log_std": -3.0, "policy.inputs": "state",
 }
 """Of every task in these scenes. A rollout begins with a reset and is as long as an episode: what comes after it would
 never be trained on."""
