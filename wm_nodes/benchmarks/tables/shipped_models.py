@@ -41,7 +41,7 @@ def objects() -> Rows:
         first, *_ = found = [split[task] for split in splits]
         moved, tool = (
             ["/".join(f"{one[f'{name}_rollout_cm_h16']:.1f}" for one in found),
-             *(f"{first[f'{name}_{kind}_cm_h16']:.1f}" for kind in ("floor", "copy"))]
+             *(f"{first[f'{name}_{kind}_cm_h16']:.1f}" for kind in ("latents", "copy"))]
             for name in ("object_moved", "tool")
         )
         done = ("/".join(f"{one[f'done_{task}_{name}']:.2f}" for one in found) for name in ("precision", "recall"))
