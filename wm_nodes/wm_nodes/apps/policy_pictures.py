@@ -122,12 +122,12 @@ def play(environment: Environment, policy: ImagePolicy, seed: int) -> Episode:
 
 
 def side_by_side(models: WorldModels, episodes: list[Episode], config: RunConfig) -> list[SideBySide]:
-    """Imagine the actions of real episodes, and the goal of each first frame."""
+    """Imagine the actions of real episodes, and the goal of each first frame where all instructions are known words."""
     arrays: EpisodeArrays = stack_episodes(episodes, models.tasks)
     tasks = [models.task_index(task) for task in arrays.recorded_tasks]
     imagined = imagine_episodes(models.tokenizer, models.action, arrays)
     goals = None
-    if models.text is not None:
+    if models.text is not None and all(map(models.text.knows, arrays.instructions)):
         goals = imagine_goals(
             models.text, models.tokenizer, arrays.images[:, 0], arrays.instructions, tasks,
             horizon=models.spec.max_episode_steps, threshold=config.reward.goal_threshold,

@@ -79,6 +79,14 @@ class TextModel(FrameModel):
         tokens, visible = self.condition_of(instructions, *latents_BTSD.shape[:2])
         return self.predict(latents_BTSD, tokens, caches, visible)
 
+    def knows(self, instruction: str) -> bool:
+        """Whether it was trained on the words of an instruction."""
+        try:
+            self.condition([instruction])
+        except ValueError:
+            return False
+        return True
+
     def condition_of(self, instructions: Sequence[str], batch: int, frames: int) -> tuple[Tensor, Tensor | None]:
         """The condition (B, T, L + 1, D) of every frame, and its mask (B, L + 1)."""
         tokens, visible = self.condition(instructions)

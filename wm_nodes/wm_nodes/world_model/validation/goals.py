@@ -9,7 +9,7 @@ from wm_nodes.core.types import FloatArray
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.positions import columns_of
-from wm_nodes.world_model.text import TextModel, imagine_goals, instruction_for, task_instruction
+from wm_nodes.world_model.text import imagine_goals, instruction_for, task_instruction
 from wm_nodes.world_model.training.tokenizer import episode_targets
 from wm_nodes.world_model.validation.open_loop import position_reader
 
@@ -34,7 +34,7 @@ def goal_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig
     told = [
         instruction_for(task, episodes.recorded_tasks[row], episodes.instructions[row], otherwise) for row in rows
     ]
-    known = np.array([_knows(models.text, text) for text in told])
+    known = np.array([models.text.knows(text) for text in told])
     rows, instructions = rows[known], [text for text, knows in zip(told, known) if knows]
     metrics = {"goal_episodes": float(known.sum()), "goal_left_out": float((~known).sum())}
     if not len(rows):
@@ -63,11 +63,3 @@ def goal_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig
         low, high = bootstrap_ratio(errors[name, ""], errors[name, "_copy"], seed=0)
         metrics |= {f"goal_{name}_ratio_low": low, f"goal_{name}_ratio_high": high}
     return metrics
-
-
-def _knows(text: TextModel, instruction: str) -> bool:
-    try:
-        text.condition([instruction])
-    except ValueError:
-        return False
-    return True
