@@ -165,7 +165,9 @@ class Storm:
 
     def _end_goals(self) -> None:
         """Cancel what the last messages have started, until nothing is."""
-        cancel = {name: service for name, service in self.services.items() if service.kind is CancelGoal}
+        cancel = [name for name, service in self.services.items() if service.kind is CancelGoal]
+        for name in cancel:  # all at once: a goal that goes on while another one ends would get more done
+            self.services[name].client.call_async(CancelGoal.Request())
         for name in cancel:
             wait_until(
                 f"the end of the goals of {name}",
