@@ -77,8 +77,7 @@ def _shown_to(row: Run) -> str:
     """The demonstrations of a row's clone, and recoveries."""
     sft = row["config"]["sft"]
     more = sft.get("recoveries", 0)
-    noise = " with noise" if sft.get("state_noise_m") else ""
-    return f"{sft['num_demonstrations']}{f' and {more} recoveries' if more else ''}{noise}"
+    return f"{sft['num_demonstrations']}{f' and {more} recoveries' if more else ''}"
 
 
 def table_1_gains() -> Rows:
