@@ -61,6 +61,13 @@ def test_the_environment_ends_where_the_learned_reward_says_so(
     assert (result.terminated == (result.success_probability > config.reward.success_threshold)).all()
 
 
+def test_learned_rewards_refuse_noise_on_what_they_read() -> None:
+    noisy = CONFIG.with_values(imagined_environment=CONFIG.imagined_environment.with_values(picture_noise=0.5))
+    place: Any = SimpleNamespace(config=noisy, model_dir=Path("none"))
+    with pytest.raises(ValueError, match=r"picture_noise is 0\.5, and learned rewards .* set it to 0"):
+        environment_paid_by(EMBEDDING, place, EPISODES, Path("none"))
+
+
 def test_the_reward_agent_pays_the_last_step_of_each_whole_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     """Environment 0 succeeds at step 1 and is reset, then time is over; 1 is cut by the rollout's end."""
     T, N = 6, 2

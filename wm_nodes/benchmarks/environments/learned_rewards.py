@@ -104,9 +104,13 @@ def environment_paid_by(reward: Learned, place: Workplace, episodes: int, work: 
         episodes: that it is learned from. work: folder of these.
 
     Raises:
-        ValueError: as best_threshold.
+        ValueError: imagined_environment.picture_noise is set; or as best_threshold.
     """
-    config, models = place.config, models_of(place.model_dir, place.config.device)
+    config = place.config
+    if noise := config.imagined_environment.picture_noise:
+        raise ValueError(f"imagined_environment.picture_noise is {noise}, and learned rewards read pictures without "
+                         "noise; set it to 0")
+    models = models_of(place.model_dir, config.device)
     seen = episodes_learned_from(config, models, episodes, work)
 
     def shift(values: NDArray[np.float64]) -> float:

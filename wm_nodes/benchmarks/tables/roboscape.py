@@ -25,7 +25,7 @@ from benchmarks.environments.roboscape import (
     gain,
     success_of,
 )
-from benchmarks.tables.table import Rows, Run, interval, percent, read
+from benchmarks.tables.table import Rows, Run, interval, read
 from wm_nodes.config.scenes import splits
 from wm_nodes.config.schema import PolicyInputs
 from wm_nodes.config.tasks import parts_of
@@ -134,12 +134,13 @@ def clones() -> Rows:
     for task, seen in product(CLONED, get_args(PolicyInputs)):
         of = [row for row in found if (row["task"], row["config"]["policy"]["inputs"]) == (task, seen)]
         for count in sorted({row["config"]["sft"]["num_demonstrations"] for row in of}):
-            its = {bool(row["config"]["sft"]["heldout"]): row["success"] for row in of
-                   if row["config"]["sft"]["num_demonstrations"] == count}
+            its = [row for row in of if row["config"]["sft"]["num_demonstrations"] == count]
+            late, early = ([row for row in its if bool(row["config"]["sft"]["heldout"]) == held]
+                           for held in (False, True))
             yield (
-                task, seen, count,
-                *(percent(its[early][split]["rate"]) if early in its else "" for early in (False, True)
-                  for split in splits()),
+                task, seen, count, ", ".join(str(row["seed"]) for row in late),
+                *(by_seed([100 * row["success"][split]["rate"] for row in rows]) if rows else ""
+                  for rows in (late, early) for split in splits()),
             )
 
 
