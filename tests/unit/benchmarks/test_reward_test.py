@@ -110,3 +110,8 @@ def test_a_reward_is_judged_by_success_by_an_empty_hand_and_along_time(found: Im
     assert told["auroc"][0] == pytest.approx(8 / 9) and told["auroc_empty_hand"] == pytest.approx(5 / 6)
     assert told["rank_correlation"] == pytest.approx(1) and (told["episodes_scored"], told["successes"]) == (6, 3)
     assert judge_reward(-scores, found, 0)["rank_correlation"] == pytest.approx(-1)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_reward_that_never_changes_along_a_success_has_no_rank_correlation(found: Imagined) -> None:
+    assert np.isnan(judge_reward(np.zeros((EPISODES, STEPS)), found, 0)["rank_correlation"])

@@ -287,7 +287,7 @@ def judge_reward(values: NDArray[np.float64], found: Imagined, seed: int) -> dic
         "episodes_scored": len(won), "successes": int(won.sum()),
         "auroc": [auroc(won, scores), *np.nanquantile(drawn, (0.025, 0.975)).tolist()],
         "auroc_empty_hand": auroc(won[won | empty], scores[won | empty]),
-        "rank_correlation": float(np.nanmean(along)) if along else float("nan"),
+        "rank_correlation": float(np.nanmean(along)) if np.isfinite(along).any() else float("nan"),
     }
 
 
