@@ -74,6 +74,14 @@ def test_another_camera_and_another_robots_reader_are_refused(tmp_path: Path) ->
         load_object_reader(tmp_path / READER, other)
 
 
+def test_what_was_at_the_start_of_a_clip_is_read_off_its_first_picture() -> None:
+    spec = configured_spec(load_config("base", {"task": "push", "simulation.object_state": "truth"}))
+    images = np.random.default_rng(0).integers(0, 256, (3, spec.height, spec.width, 3), np.uint8)
+    filled = ObjectReader(spec).fill_clip(images, np.zeros((3, spec.state_dim), np.float32))
+    now, start = (filled[:, spec.state_names.index(name)] for name in ("object_x", "object_start_x"))
+    assert (start == now[0]).all() and len(set(now)) == 3
+
+
 def test_states_say_the_truth_while_a_model_is_made_and_then_what_its_reader_sees(tmp_path: Path) -> None:
     plain, made = load_config("base", {"task": "push"}), load_config("base", {"task": "push", **SETTINGS})
     assert with_truth(plain) is plain and with_truth(made).simulation.object_state == "truth"

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from wm_nodes.config.object_state import READER
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.training.weights import WeightsError, load_weights_file
@@ -33,6 +34,7 @@ class ObjectReader(nn.Module):
     def __init__(self, spec: EnvironmentSpec) -> None:
         super().__init__()
         self.height, self.width, self.views = spec.height, spec.width, len(spec.cameras)
+        self.state_names = spec.state_names
         self.measured = tuple(i for i in spec.measured if START not in spec.state_names[i])
         self.commanded = tuple(i for i in range(spec.tool_dim) if i not in spec.measured)
         layers: list[nn.Module] = [nn.Conv2d(3, CHANNELS, 5, stride=2, padding=2), nn.SiLU()]
@@ -77,12 +79,27 @@ class ObjectReader(nn.Module):
         return filled
 
 
+    def fill_clip(self, images: UInt8Array, states: FloatArray) -> FloatArray:
+        """As fill, of one episode's frames from its first on, off which what was at the start is read, too."""
+        filled = self.fill(images, states)
+        for column, name in enumerate(self.state_names):
+            if START in name:
+                filled[:, column] = filled[0, self.state_names.index(name.replace(START, "_"))]
+        return filled
+
+
 def keypoints(maps_BKHW: Tensor, sharpness: Tensor) -> Tensor:
     """Of each map the expected place of its softmax, x and y in [-1, 1], and its maximum, (B, 3 K)."""
     height, width = maps_BKHW.shape[2:]
     shares = (maps_BKHW.flatten(2) * sharpness).softmax(-1).view_as(maps_BKHW)
     across, down = (torch.linspace(-1, 1, n, device=maps_BKHW.device) for n in (width, height))
     return torch.cat((shares.sum(2) @ across, shares.sum(3) @ down, maps_BKHW.amax((2, 3))), 1)
+
+
+def reader_of(folder: Path, spec: EnvironmentSpec) -> ObjectReader | None:
+    """The reader in a world model's folder, where there is one. Raises as load_object_reader."""
+    path = folder / READER
+    return load_object_reader(path, spec) if path.is_file() else None
 
 
 def load_object_reader(path: Path, spec: EnvironmentSpec) -> ObjectReader:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from wm_nodes.apps.options import add_device, add_seed, positive
 from wm_nodes.core.device import CPU, compute_device
+from wm_nodes.environments.object_reader import reader_of
 from wm_nodes.judge.one_class.calibration import MOVING, calibrate
 from wm_nodes.judge.one_class.ranges import KEPT, NAMES, save_ranges
 from wm_nodes.recording import read_episodes
@@ -35,7 +36,10 @@ def run(arguments: argparse.Namespace) -> None:
     """Write the ranges and print how far recordings go."""
     models = load_model_folder(arguments.model_dir, compute_device(arguments.device))
     episodes = [episode for bag in arguments.bags for episode in read_episodes(bag)]
-    ranges = calibrate(models, episodes, stride=arguments.stride, seed=arguments.seed, moving=arguments.moving)
+    ranges = calibrate(
+        models, episodes, stride=arguments.stride, seed=arguments.seed, moving=arguments.moving,
+        reader=reader_of(arguments.model_dir, models.spec),
+    )
     path = save_ranges(arguments.model_dir, replace(ranges, story={**ranges.story, "command": arguments.command}))
     print(
         f"{path}: {ranges.story['recordings']} recordings, {len(NAMES)} numbers; "

@@ -19,6 +19,7 @@ import numpy as np
 
 from wm_nodes.core.device import CPU, compute_device
 from wm_nodes.core.model_folder import ModelFolderError, files_sha256
+from wm_nodes.environments.object_reader import reader_of
 from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, JudgeError, Read, ReadRequest, reads_of
 from wm_nodes.judge.agent.levels import first_vote
 from wm_nodes.judge.agent.types import (
@@ -38,7 +39,7 @@ from wm_nodes.judge.one_class.pictures import HUES, picture_numbers, things_in
 from wm_nodes.judge.one_class.ranges import COMPONENTS, KEPT, NormalRanges, file_of, load_ranges, strides_of
 from wm_nodes.world_model import WorldModels, load_model_folder
 
-REVISION = "2"
+REVISION = "3"
 """Raised whenever the same ranges give other answers, so that two versions have two identities."""
 CACHED_CLIPS = 64
 """Clips whose numbers are kept, for the stages of one verdict."""
@@ -90,6 +91,7 @@ class OneClassJudge:
     def __init__(self, folder: Path, conformal: float = 0.0, device: str = CPU) -> None:
         self._folder = folder
         self._models: WorldModels = load_model_folder(folder, compute_device(device))
+        self._reader = reader_of(folder, self._models.spec)
         self._ranges = ranges_of(folder, self._models.manifest)
         self._conformal = conformal
         self._sure = {
@@ -176,7 +178,9 @@ class OneClassJudge:
             return ranges, Finding(reason, {}, {}, (Status.OK, ""))
         side, origin = self._models.spec.height, np.asarray(ranges.origin, np.float32)
         numbers = picture_numbers(clip.frames, task.reference_frame, side, ranges.still)
-        drawn, done = model_numbers(self._models, clip.frames, ranges.stride, origin, ranges.height_m)
+        drawn, done = model_numbers(
+            self._models, clip.frames, ranges.stride, origin, ranges.height_m, self._reader
+        )
         strange = ranges.strangeness(numbers | drawn)
         worst: dict[Component, tuple[float, str]] = {}
         for name, component in COMPONENTS.items():

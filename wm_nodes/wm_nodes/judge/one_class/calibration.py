@@ -13,6 +13,7 @@ from wm_nodes.core.action_spaces import tool_columns
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Episode, FloatArray, UInt8Array
+from wm_nodes.environments.object_reader import ObjectReader
 from wm_nodes.judge.one_class import imagination, pictures
 from wm_nodes.judge.one_class.ranges import NormalRanges, done_threshold, fit
 from wm_nodes.world_model import WorldModels
@@ -40,7 +41,8 @@ class _Rows:
 
 
 def calibrate(
-    models: WorldModels, episodes: Iterable[Episode], *, stride: int, seed: int, moving: Sequence[str] = MOVING
+    models: WorldModels, episodes: Iterable[Episode], *, stride: int, seed: int, moving: Sequence[str] = MOVING,
+    reader: ObjectReader | None = None,
 ) -> NormalRanges:
     """Measure the normal ranges of a world model's clips.
 
@@ -48,6 +50,7 @@ def calibrate(
         episodes: recorded ones in the model's cameras, done and undone, of the tasks that shall be judged.
         stride: steps between two frames of a clip.
         moving: names of the cameras that move; in the pictures of the others the scenery stays.
+        reader: of the model's folder, as of model_numbers.
 
     Raises:
         ValueError: too few recordings, pictures of another size than the model's, states that lack values of its
@@ -67,7 +70,7 @@ def calibrate(
         for shown in _forms(models, episode, steps, stride, rng):
             reference = episode.images[0]
             seen = pictures.picture_numbers(shown, reference, models.spec.height, still)
-            drawn, signals = imagination.model_numbers(models, shown, stride, origin, height_m)
+            drawn, signals = imagination.model_numbers(models, shown, stride, origin, height_m, reader)
             rows.numbers.append(seen | drawn)
             rows.recording.append(index)
             for task, done in done_at(models.tasks, episode, steps).items():

@@ -4,6 +4,8 @@ The actions between two frames are read off the tool, so that a clip needs none 
 Shapes: T frames, H W 3 image, S tokens, D values per token, A action, J tasks.
 """
 
+from itertools import pairwise
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -11,9 +13,11 @@ from torch.nn import functional as F
 
 from wm_nodes.core.action_spaces import tool_columns
 from wm_nodes.core.types import FloatArray, UInt8Array
+from wm_nodes.environments.object_reader import ObjectReader
 from wm_nodes.world_model import ActionModel, WorldModels
 from wm_nodes.world_model.dynamics import done_signal
 from wm_nodes.world_model.positions import columns_of
+from wm_nodes.world_model.state_model import next_states
 from wm_nodes.world_model.tokenizer import normalise_tokens
 
 BLOCK_PX = 8
@@ -36,7 +40,8 @@ COMPONENTS = {
 
 @torch.inference_mode()
 def model_numbers(
-    models: WorldModels, frames: UInt8Array, stride: int, origin: FloatArray, height_m: float
+    models: WorldModels, frames: UInt8Array, stride: int, origin: FloatArray, height_m: float,
+    reader: ObjectReader | None = None,
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return the numbers of COMPONENTS, and the done signal at the end of each task that the model knows.
 
@@ -44,6 +49,8 @@ def model_numbers(
         frames: uint8 (T, H, W, 3), T >= 2, in the model's cameras. stride: steps between frames.
         origin: (3,), what the probe's tool positions lack to be the model's states, m.
         height_m: of the object's middle.
+        reader: of the model's folder: what its states say of things, and the done signal of them, is read off the
+            frames, and goes on as the model predicts.
 
     Raises:
         ValueError: frames of another size, a model over discrete tokens or without a position probe, or a robot whose
@@ -58,7 +65,10 @@ def model_numbers(
     missed = (redrawn.float() - torch.from_numpy(frames).to(redrawn.device).float()).abs().mean(3)
     places = models.probe.read(frames)
     tool, thing, goal = (places[:, columns_of(models.tasks[0], name)] for name in ("tool", "object", "goal"))
-    imagined, logits = _next_frames(model, models, latents, torch.tensor(tool, device=latents.device), stride, origin)
+    actions, states = _between(model, models, torch.tensor(tool, device=latents.device), stride, origin)
+    told = None if reader is None else _read_states(model, reader, frames, latents, actions, states)
+    imagined, logits = _next_frames(model, latents, actions, states)
+    logits = logits if told is None else told
     error, still = (imagined - latents[1:]).square().mean(), (latents[1:] - latents[:-1]).square().mean()
     moved, went = (np.linalg.norm(np.diff(path, axis=0), axis=1) for path in (thing, tool))
     per_frame = missed.mean((1, 2))
@@ -100,10 +110,11 @@ def _from_path(path: FloatArray, points: FloatArray) -> FloatArray:
     return distance
 
 
-def _next_frames(
-    model: ActionModel, models: WorldModels, latents_TSD: Tensor, tool_T3: Tensor, stride: int, origin: FloatArray
+def _between(
+    model: ActionModel, models: WorldModels, tool_T3: Tensor, stride: int, origin: FloatArray
 ) -> tuple[Tensor, Tensor]:
-    """The next frame imagined from each true one, (T - 1, S, D), and done logits there (T - 1, heads, J)."""
+    """The actions (T - 1, A) of the steps between two frames, and the states (stride + 1, T - 1, P) before and after
+    each: of what is not the tool's place, the mean."""
     moving, placed = tool_columns(models.spec)
     step = tool_T3.diff(dim=0) / stride
     actions = step.new_zeros(len(step), models.spec.action_dim)
@@ -111,15 +122,40 @@ def _next_frames(
     between = torch.stack([tool_T3[:-1] + i * step for i in range(stride + 1)]) + torch.from_numpy(origin).to(tool_T3)
     states = model.condition.state_mean.to(between).repeat(*between.shape[:2], 1)
     states[..., placed] = between
-    if stride == 1:
+    return actions, states
+
+
+def _read_states(
+    model: ActionModel, reader: ObjectReader, frames: UInt8Array, latents_TSD: Tensor, actions: Tensor,
+    states: Tensor,
+) -> Tensor | None:
+    """Fill the measured values of the states of _between in place, as read off the frame before and as the model
+    predicts from there; return the done logits (T - 1, heads, J) of what is read off the frame after, None where states
+    do not tell what is done."""
+    stride, ends = len(states) - 1, torch.cat((states[0], states[-1, -1:]))
+    seen = torch.from_numpy(reader.fill_clip(frames, ends.cpu().numpy())).to(states)
+    moves = seen.diff(dim=0) / stride
+    states[0], earlier = seen[:-1], seen[:-1] - torch.cat((0 * moves[:1], moves[:-1]))
+    for i in range(stride):
+        states[i + 1] = next_states(model, latents_TSD[:-1], actions, states[i], earlier, states[i + 1])
+        earlier = states[i]
+    return model.told(seen[1:], seen[1:] - moves)
+
+
+def _next_frames(
+    model: ActionModel, latents_TSD: Tensor, actions: Tensor, states: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The next frame imagined from each true one, (T - 1, S, D), and done logits there (T - 1, heads, J). actions,
+    states: of _between."""
+    if len(states) == 2:
         prediction = model(latents_TSD[:-1][None], actions[None], states[0][None], states[1][None])
         return normalise_tokens(latents_TSD[:-1] + prediction.change_BTSD[0]), prediction.done_logits_BTKJ[0]
     caches = model.trunk.new_ring_caches(1, latents_TSD.device)
     imagined, done = list[Tensor](), list[Tensor]()
-    for t in range(len(step)):
+    for t in range(len(actions)):
         current, row = latents_TSD[t : t + 1], slice(t, t + 1)
-        for i in range(stride):
-            current, logits = model.advance(current, actions[row], states[i, row], states[i + 1, row], caches)
+        for before, after in pairwise(states):
+            current, logits = model.advance(current, actions[row], before[row], after[row], caches)
         imagined.append(current[0])
         done.append(logits[0])
     return torch.stack(imagined), torch.stack(done)
