@@ -34,8 +34,9 @@ class ObjectReader(nn.Module):
     def __init__(self, spec: EnvironmentSpec) -> None:
         super().__init__()
         self.height, self.width, self.views = spec.height, spec.width, len(spec.cameras)
-        self.state_names = spec.state_names
-        self.measured = tuple(i for i in spec.measured if START not in spec.state_names[i])
+        names = spec.state_names
+        self.measured = tuple(i for i in spec.measured if START not in names[i])
+        self.starts = {i: names.index(names[i].replace(START, "_")) for i in spec.measured if START in names[i]}
         self.commanded = tuple(i for i in range(spec.tool_dim) if i not in spec.measured)
         layers: list[nn.Module] = [nn.Conv2d(3, CHANNELS, 5, stride=2, padding=2), nn.SiLU()]
         for dilation in DILATIONS:
@@ -78,13 +79,11 @@ class ObjectReader(nn.Module):
             filled[i : i + BATCH, self.measured] = self(pixels, commanded).numpy()
         return filled
 
-
     def fill_clip(self, images: UInt8Array, states: FloatArray) -> FloatArray:
         """As fill, of one episode's frames from its first on, off which what was at the start is read, too."""
         filled = self.fill(images, states)
-        for column, name in enumerate(self.state_names):
-            if START in name:
-                filled[:, column] = filled[0, self.state_names.index(name.replace(START, "_"))]
+        for start, now in self.starts.items():
+            filled[:, start] = filled[0, now]
         return filled
 
 

@@ -19,11 +19,11 @@ STEPS, TASK = 8, "push"
 class ToldReader(ObjectReader):
     """Says that the object has moved along x by `way` in the middle of the clip, and lies still."""
 
-    way = 0.0
+    way, moving = 0.0, 0
 
     def fill(self, images: UInt8Array, states: FloatArray) -> FloatArray:
         filled = super().fill(images[:1].repeat(len(images), 0), states)
-        filled[:, self.state_names.index("object_x")] += np.linspace(0, 2 * self.way, len(images)).clip(max=self.way)
+        filled[:, self.moving] += np.linspace(0, 2 * self.way, len(images)).clip(max=self.way)
         return filled
 
 
@@ -45,6 +45,7 @@ def test_what_is_done_is_read_off_the_clip(models: WorldModels, stride: int) -> 
     found = reader_of(folder, models.spec)
     assert found is not None
     reader.load_state_dict(found.state_dict())
+    reader.moving = models.spec.state_names.index("object_x")
     done = dict[float, float]()
     for way in (0.0, 0.2):
         reader.way = way

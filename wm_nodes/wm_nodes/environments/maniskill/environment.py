@@ -19,7 +19,6 @@ from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, 
 from wm_nodes.environments.maniskill.behaviours import ROBOT_BASE
 from wm_nodes.environments.maniskill.cameras import table_top_cameras
 from wm_nodes.environments.maniskill.control import CONTROLS
-from wm_nodes.environments.maniskill.objects import STARTS
 from wm_nodes.environments.maniskill.scenes import make_scene, render, renew_physics
 from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.environments.object_reader import load_object_reader
@@ -160,8 +159,8 @@ class ManiSkillEnvironment:
         elif self._reader:
             read = self._reader.fill(self._images[i : i + 1], self._states[i : i + 1])[0]
             if not self._steps[i]:
-                for name in STARTS:
-                    read[names.index(name)] = read[names.index(name.replace("start_", ""))]
+                for start, now in self._reader.starts.items():
+                    read[start] = read[now]
             state[:] = read
         else:
             hidden = simulator_part(self._parts[i]).hidden_state
