@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from wm_nodes.config.load import load_config
+from wm_nodes.config.object_state import READER, with_reader
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import get_task, success, task_names
 from wm_nodes.core.tool_control import check_actions, next_state
@@ -24,7 +25,13 @@ from wm_nodes.environments.maniskill.episodes import EXTREME, HOLD_STEPS, planne
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner
 from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
-from wm_nodes.environments.record import collect_plan, demonstration_plan, recovery_plan
+from wm_nodes.environments.record import (
+    acceptance_plan,
+    collect_plan,
+    demonstration_plan,
+    keep_plan,
+    recovery_plan,
+)
 from wm_nodes.policy_rl.behaviour_cloning import demonstrations
 from wm_nodes.policy_rl.initial_policy import prepare_start
 from wm_nodes.recording import read_episodes
@@ -250,3 +257,22 @@ def test_a_start_with_recoveries_is_cloned_twice(tmp_path: Path) -> None:
     assert [episode.behaviour for bag in bags for episode in read_episodes(bag)] == [RECOVERY] * 4
     with pytest.raises(ValueError, match=r"were made with sft\.recoveries 2, not 0"):
         prepare_start(config.with_values(sft=config.sft.with_values(recoveries=0)), tmp_path, model)
+
+
+@pytest.mark.slow
+def test_a_start_goes_on_where_its_model_was_moved_and_not_with_another_reader(tmp_path: Path) -> None:
+    config = load_config("smoke", {"task": "push", "data.num_workers": 1})
+    run, old, new = tmp_path / "run", tmp_path / "old", tmp_path / "new"
+    shutil.copytree(shipped_model("push"), old)
+    begun = prepare_start(with_reader(config, old), run, old)
+    made = [path.read_bytes() for path in begun]
+    keep_plan(acceptance_plan(with_reader(config, old)), tmp_path)
+    old.rename(new)
+    moved = with_reader(config, new)
+    assert [path.read_bytes() for path in prepare_start(moved, run, new)] == made
+    keep_plan(acceptance_plan(moved), tmp_path)
+    (new / READER).write_bytes(b"another one")
+    with pytest.raises(ValueError, match=r"were made with simulation\.object_state sha256 .*; take another folder"):
+        prepare_start(moved, run, new)
+    with pytest.raises(ValueError, match="was begun with simulation"):
+        keep_plan(acceptance_plan(moved), tmp_path)

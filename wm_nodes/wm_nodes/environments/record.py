@@ -8,10 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from wm_nodes.config.environments import TRUTH, SimulationConfig
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT, STARTS, SeedRange, demonstration_seeds
 from wm_nodes.config.tasks import get_task, model_tasks, recorded_task
-from wm_nodes.core.files import write_atomic
+from wm_nodes.core.files import file_sha256, write_atomic
 from wm_nodes.core.types import Episode
 from wm_nodes.environments import collection
 from wm_nodes.environments.collection import CollectionPlan, PolicyAct, collect
@@ -105,13 +106,21 @@ def collect_plan(plan: CollectionPlan, config: RunConfig, folder: Path) -> list[
     return bags
 
 
+def as_compared(simulation: SimulationConfig) -> dict[str, Any]:
+    """The settings that recordings follow from, a reader by its content: its folder may be moved, or copied."""
+    values = simulation.model_dump(mode="json", exclude={"render_device"})
+    if simulation.object_state != TRUTH and (reader := Path(simulation.object_state)).is_file():
+        values["object_state"] = f"sha256 {file_sha256(reader)}"
+    return values
+
+
 def keep_plan(plan: CollectionPlan, folder: Path) -> None:
     """Write the plan into a folder of its bags alone.
 
     Raises:
         ValueError: the folder was begun with another plan; more episodes are none, but for a short last bag.
     """
-    path, text = folder / PLAN, json.dumps({**vars(plan), "simulation": plan.simulation.model_dump()}, default=str)
+    path, text = folder / PLAN, json.dumps({**vars(plan), "simulation": as_compared(plan.simulation)}, default=str)
     if path.exists() and path.read_text(encoding="utf-8") != text:
         kept, now = json.loads(path.read_text(encoding="utf-8")), json.loads(text)
         others = [name for name, value in now.items() if kept.get(name, value) != value]

@@ -22,6 +22,7 @@ from wm_nodes.core.types import RECOVERY, Episode
 from wm_nodes.environments.collection import CollectionPlan
 from wm_nodes.environments.object_reader import load_object_reader
 from wm_nodes.environments.record import (
+    as_compared,
     collect_plan,
     demonstration_plan,
     first_frames_plan,
@@ -153,10 +154,10 @@ def start_files(run_dir: Path) -> tuple[Path, Path]:
 def _keep_settings(config: RunConfig, run_dir: Path, model_dir: Path) -> None:
     """Write beside the starts what they and the weak policy follow from; refuse a folder of others."""
     made_of = config.model_dump(mode="json", include={
-        "task": True, "seed": True, "simulation": True, "sft": True, "policy": True,
+        "task": True, "seed": True, "sft": True, "policy": True,
         "data": {"start_frames", "behaviours"} if config.data.start_frames == "any" else {"start_frames"},
     })
-    made_of["simulation"].pop("render_device")
+    made_of["simulation"] = as_compared(config.simulation)
     now = {
         f"{section}.{name}": value for section, values in made_of.items() if isinstance(values, dict)
         for name, value in values.items()
