@@ -13,7 +13,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.types import Rollout
 from wm_nodes.environments.maniskill.spec import simulation_spec
-from wm_nodes.policy_rl.device_rollout import MOST_HASHED_STARTS, DeviceCollector, Step, make_collector, rollout_starts
+from wm_nodes.policy_rl.device_rollout import DeviceCollector, Step, make_collector, rollout_starts
 from wm_nodes.policy_rl.factories import (
     make_device_environment,
     make_endogenous_reward,
@@ -190,12 +190,12 @@ def test_a_rollout_repeats_and_keeps_its_numbers_while_the_next_is_made() -> Non
         torch.testing.assert_close(getattr(again, name), kept[name], rtol=0, atol=0, equal_nan=True)
 
 
-def test_large_rollouts_draw_their_starts_at_once() -> None:
-    many = rollout_starts(0, 1, 2, MOST_HASHED_STARTS, 64)
-    assert many.shape == (2, MOST_HASHED_STARTS) and set(np.unique(many)) == set(range(64))
-    np.testing.assert_array_equal(many, rollout_starts(0, 1, 2, MOST_HASHED_STARTS, 64))
-    assert (many != rollout_starts(0, 2, 2, MOST_HASHED_STARTS, 64)).any()
-    groups = rollout_starts(0, 1, 2, MOST_HASHED_STARTS, 64, 2).reshape(2, -1, 2)
+def test_a_rollout_begins_at_all_starts_and_groups_at_one() -> None:
+    many = rollout_starts(0, 1, 2, 1024, 64)
+    assert many.shape == (2, 1024) and set(np.unique(many)) == set(range(64))
+    np.testing.assert_array_equal(many, rollout_starts(0, 1, 2, 1024, 64))
+    assert (many != rollout_starts(0, 2, 2, 1024, 64)).any()
+    groups = rollout_starts(0, 1, 2, 1024, 64, 2).reshape(2, -1, 2)
     assert (groups == groups[..., :1]).all() and set(np.unique(groups)) == set(range(64))
 
 

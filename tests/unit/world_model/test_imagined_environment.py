@@ -200,9 +200,20 @@ def test_a_done_signal_above_the_threshold_terminates_and_never_also_truncates(m
 
 
 def test_too_much_disagreement_of_the_done_heads_truncates(models: WorldModels) -> None:
-    env = make(models, uncertainty_limit=1e-9)
-    env.reset()
-    assert env.step(actions(0)).truncated.all()
+    for threshold in (0.0, 1.0):  # crossed in the same step, and not: neither is a success
+        env = make(models, uncertainty_limit=1e-9, success_threshold=threshold)
+        env.reset()
+        result = env.step(actions(0))
+        assert result.truncated.all() and not result.terminated.any()
+
+
+def test_as_many_episodes_as_starts_begin_at_each_once(models: WorldModels) -> None:
+    env = make(models)
+    seeds, begun = np.arange(1_500_000, 1_500_000 + NUM_STARTS, dtype=np.uint64), list[int]()
+    for first in range(NUM_STARTS):
+        env.reset(None, np.roll(seeds, first)[:NUM_ENVS])
+        begun.append(int(env.episodes.starts_N[0]))
+    assert sorted(begun) == [*range(NUM_STARTS)]
 
 
 def test_the_spec_says_imagined_and_names_the_model(models: WorldModels) -> None:

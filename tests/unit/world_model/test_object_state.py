@@ -15,6 +15,7 @@ from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.environments.registry import configured_spec
 from wm_nodes.policy_rl.device_rollout import DeviceCollector, make_collector, unseen_pictures_left_out
 from wm_nodes.policy_rl.factories import make_endogenous_reward, make_policy
+from wm_nodes.policy_rl.model_refresh import check_refreshable
 from wm_nodes.policy_rl.rollouts import TensorRollout, collect_rollout
 from wm_nodes.policy_rl.validation.evaluation import evaluate
 from wm_nodes.world_model import (
@@ -214,6 +215,22 @@ def test_a_policy_of_the_state_sees_nothing_of_the_picture(config: RunConfig, tm
     moved[:, spec.state_names.index("object_x")] += 0.05
     assert not np.array_equal(policy.act(pictures[0], moved).actions, first)
     np.testing.assert_array_equal(policy.clone().act(pictures[0], state).actions, first)
+
+
+def test_what_would_do_nothing_where_places_are_in_the_state_is_refused(config: RunConfig, tmp_path: Path) -> None:
+    folder = folder_of(config, tmp_path)
+    for section, name in (("policy", "dropout"), ("imagined_environment", "picture_noise")):
+        asked = config.with_values(**{section: getattr(config, section).with_values(**{name: 0.1})})
+        with pytest.raises(ValueError, match=rf"{section}\.{name} is 0\.1, and a policy with policy\.inputs state"):
+            make_policy(asked, folder)
+    models = load_model_folder(folder)
+    with pytest.raises(ValueError, match=r"second_model predicts pictures, and push has places in its state"):
+        DeviceEnvironment(
+            models, configured_spec(config), told_models(config, tmp_path / "told")[1], config.reward, num_envs=2,
+            with_goals=False, second=models,
+        )
+    with pytest.raises(ValueError, match=r"predicts places by a model of states, which rounds do not refresh; set"):
+        check_refreshable(folder)
 
 
 def test_a_policy_that_would_see_the_commanded_tool_alone_is_refused(config: RunConfig, tmp_path: Path) -> None:

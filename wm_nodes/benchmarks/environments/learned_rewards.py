@@ -146,7 +146,8 @@ def train_by_verdicts(place: Workplace, policy: ImagePolicy, imagined: ImaginedE
 
 
 def paid_by_verdicts(rollout: Rollout, instruction: str, config: RunConfig) -> Rollout:
-    """The rollout with the reward agent's reward at the last step of each episode that ended, and none elsewhere."""
+    """The rollout with the reward agent's reward at the last step of each episode that ended, and none elsewhere. A
+    last step without a verdict is not valid."""
     rewards, ends, episodes = np.zeros_like(rollout.rewards_TN), list[tuple[int, int]](), []
     for env in range(rewards.shape[1]):
         first = 0
@@ -159,4 +160,5 @@ def paid_by_verdicts(rollout: Rollout, instruction: str, config: RunConfig) -> R
                 ends.append((step, env))
     if ends:
         rewards[tuple(np.array(ends).T)] = paid_episodes(episodes, config)
-    return replace(rollout, rewards_TN=rewards)
+    said = np.isfinite(rewards)
+    return replace(rollout, rewards_TN=np.where(said, rewards, np.float32(0)), valid_TN=rollout.valid_TN & said)

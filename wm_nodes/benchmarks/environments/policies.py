@@ -31,7 +31,7 @@ from wm_nodes.policy_rl.factories import (
     make_video_environment,
 )
 from wm_nodes.policy_rl.image_policy import ImagePolicy
-from wm_nodes.policy_rl.initial_policy import prepare_start
+from wm_nodes.policy_rl.initial_policy import num_starts, prepare_start
 from wm_nodes.policy_rl.model_refresh import Round, refresh_round, run_rounds, split_updates
 from wm_nodes.policy_rl.rollouts import rollout_statistics
 from wm_nodes.policy_rl.train import train_policy
@@ -46,7 +46,7 @@ from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.validation.acceptance_report import AcceptanceReport
 
 WORLD_MODEL, SIMULATOR = "world_model", "simulator"
-SIMULATOR_ENVS, IMAGINED_EPISODES = 8, 256
+SIMULATOR_ENVS = 8
 KEPT_EVERY = 6
 """Updates between two versions of a training that are kept to be ranked."""
 
@@ -114,10 +114,11 @@ class Workplace:
             "models_sha256": [files_sha256(read_world_manifest(self.model_dir)), *shas],
         }
 
-    def imagined(self, policy: ImagePolicy, env: Environment) -> EvaluationResult:
+    def imagined(self, policy: ImagePolicy, env: ImaginedEpisodes) -> EvaluationResult:
+        """Of episodes of which each begins at another start."""
         with unseen_pictures_left_out(env, policy):
-            return evaluate(policy, env, min(IMAGINED_EPISODES, 8 * self.config.evaluation.episodes),
-                            self.config.evaluation.first_seed)
+            episodes = min(num_starts(self.config), env.episodes.num_starts)
+            return evaluate(policy, env, episodes, self.config.evaluation.first_seed)
 
 
 def train_in(

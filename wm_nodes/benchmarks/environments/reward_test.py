@@ -216,7 +216,7 @@ def paid_episodes(
         episodes: pictures (T + 1, H, W, 3), actions (T, A) and instruction of each.
 
     Raises:
-        ValueError: it gives no verdict on more than MAX_INVALID_SHARE of them; on fewer, they are paid 0.
+        ValueError: it gives no verdict on more than MAX_INVALID_SHARE of them; on fewer, they are NaN.
     """
     settings, jobs = episode_judge(config), list[ClipJob]()
     for number, (frames, actions, instruction) in enumerate(episodes):
@@ -228,7 +228,7 @@ def paid_episodes(
     if len(silent) > MAX_INVALID_SHARE * len(verdicts):
         raise ValueError(f"the reward agent gives no verdict on {len(silent)} of {len(verdicts)} episodes: "
                          f"{silent[0].status} {silent[0].reason}; mend the judge, see --judge.*")
-    return np.array([verdict.reward if verdict.valid else 0.0 for verdict in verdicts])
+    return np.array([verdict.reward if verdict.valid else np.nan for verdict in verdicts])
 
 
 def learned_heads(seen: Imagined, model_dir: Path, seed: int) -> dict[str, Callable[[Imagined], NDArray[np.float64]]]:
@@ -274,13 +274,16 @@ def largest(values: NDArray[np.float64], found: Imagined) -> NDArray[np.float64]
 
 
 def judge_reward(values: NDArray[np.float64], found: Imagined, seed: int) -> dict[str, Any]:
-    """What a reward, given by its sum up to each step (E, T), says of real success: see measure_rewards."""
-    won, scores = found.won, values[:, -1]
-    empty = np.array([behaviour == EMPTY_HAND for behaviour in found.real.behaviours]) & ~won
+    """What a reward, given by its sum up to each step (E, T), says of real success: see measure_rewards. Episodes whose
+    sum is NaN are left out."""
+    said = np.isfinite(values[:, -1])
+    won, values, success = found.won[said], values[said], found.real.success[said]
+    empty, scores = np.array(found.real.behaviours)[said] == EMPTY_HAND, values[:, -1]
+    empty &= ~won
     draws = numpy_stream(seed, "reward_test", len(won)).integers(len(won), size=(DRAWS, len(won)))
     drawn = np.array([auroc(won[rows], scores[rows]) for rows in draws])
     rows = np.flatnonzero(won)
-    first = found.real.success[rows, 1:, 0].argmax(1) + 1
+    first = success[rows, 1:, 0].argmax(1) + 1
     along = [spearman(np.arange(steps), values[row, :steps], seed=seed, draws=1)[0]
              for row, steps in zip(rows, first, strict=True) if steps > 2]
     return {

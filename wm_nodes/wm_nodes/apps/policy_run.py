@@ -191,8 +191,8 @@ def read_success(folder: Path, name: str) -> BoolArray:
 
 
 def imagined_success(job: RunContext, folder: Path, label: str, model_dir: Path, policy: Path) -> BoolArray:
-    """Success in the model that is trained in, without action noise, on num_starts() episodes, (E,)."""
-    episodes = num_starts(job.config)
+    """Success in the model that is trained in, without action noise, on num_starts() episodes, each from another start,
+    as far as there are as many, (E,)."""
     make = make_video_environment if job.video_model else make_imagined_environment
     model = Path(job.video_model or model_dir)
     sha256 = (
@@ -202,6 +202,7 @@ def imagined_success(job: RunContext, folder: Path, label: str, model_dir: Path,
     def measure() -> BoolArray:
         env = make(job.config, model, job.starts, num_envs=64, seed=job.config.seed)
         weights = load_policy(job.config, model_dir, policy)
+        episodes = min(num_starts(job.config), env.episodes.num_starts)
         return evaluate(weights, env, episodes, job.config.evaluation.first_seed).success
 
     identity = {"policy_sha256": file_sha256(policy), "model_sha256": sha256}

@@ -17,22 +17,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from wm_nodes.core.device import explain_memory
-from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Environment, Rollout
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.rollouts import (
     TensorRollout,
     action_noise,
-    check_whole_groups,
     collect_rollout,
     reset_seeds,
 )
 from wm_nodes.reward import EncoderDistance, EndogenousReward, RewardModel
 from wm_nodes.reward.endogenous import progress_along
 from wm_nodes.world_model import DeviceEnvironment, ImaginedEnvironment
-from wm_nodes.world_model.starts import start_of
+from wm_nodes.world_model.starts import starts_of
 
-MOST_HASHED_STARTS = 1024
 MOST_GOLDEN_FRAMES = 4096
 """Goals that are compared with frames at once: features of golden trajectories at every step of a rollout are
 gigabytes."""
@@ -46,16 +43,10 @@ def rollout_starts(
 ) -> NDArray[np.int64]:
     """Return (T, N) starts; entry (t, i) is used where environment i begins an episode before lock-step t.
 
-    Up to MOST_HASHED_STARTS entries they are those of ImaginedEnvironment with collect_rollout's reset_seeds, a hash in
-    Python for each (29 us); above, one draw of the stream `starts` at (seed, policy version).
+    They are those of ImaginedEnvironment with collect_rollout's reset_seeds.
     """
-    if steps * num_envs > MOST_HASHED_STARTS:
-        check_whole_groups(num_envs, envs_per_start)
-        shape = steps, num_envs // envs_per_start
-        return numpy_stream(seed, "starts", policy_version).integers(num_starts, size=shape).repeat(envs_per_start, 1)
-    seeds = (reset_seeds(seed, policy_version, max(0, step - 1), num_envs, envs_per_start) for step in range(steps))
-    rows = [[start_of(int(s), num_starts) for s in row] for row in seeds]
-    return np.array(rows, np.int64)
+    seeds = [reset_seeds(seed, policy_version, max(0, step - 1), num_envs, envs_per_start) for step in range(steps)]
+    return starts_of(np.stack(seeds), num_starts)
 
 
 def make_collector(

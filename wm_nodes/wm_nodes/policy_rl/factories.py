@@ -136,10 +136,20 @@ def make_policy(config: RunConfig, model_dir: Path | None) -> ImagePolicy:
 
 
 def check_inputs(config: RunConfig, spec: EnvironmentSpec) -> None:
-    """Raise ValueError for a policy of the state alone where that is all commanded."""
-    if config.policy.inputs == "state" and not spec.measured:
+    """Raise ValueError for a policy of the state alone where that is all commanded, or where a setting of what is seen
+    beside it would do nothing."""
+    if config.policy.inputs != "state":
+        return
+    if not spec.measured:
         raise ValueError("policy.inputs is state, and the state says of nothing but the commanded tool where it is; "
                          "take a model with an object reader (preset scenes), or latents")
+    for name, value in (
+        ("policy.dropout", config.policy.dropout),
+        ("imagined_environment.picture_noise", config.imagined_environment.picture_noise),
+    ):
+        if value:
+            raise ValueError(f"{name} is {value:g}, and a policy with policy.inputs state sees no picture; set it to "
+                             "0, or take other inputs")
 
 
 def untrained_policy(config: RunConfig) -> ImagePolicy:

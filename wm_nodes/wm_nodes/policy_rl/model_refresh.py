@@ -84,8 +84,13 @@ class RefreshDecision:
 
 
 def check_refreshable(model_dir: Path) -> None:
-    """Raise ValueError for a model that cannot be refreshed: only a continuous action model can."""
-    kind = read_world_manifest(model_dir)["tokenizer"]["kind"]
+    """Raise ValueError for a model that cannot be refreshed: only a continuous action model without a model of states
+    can. That one learns from true places and would be compared by places, not by pictures."""
+    manifest = read_world_manifest(model_dir)
+    kind = manifest["tokenizer"]["kind"]
+    if manifest["world_model"]["state_model_iterations"]:
+        raise ValueError(f"{model_dir} predicts places by a model of states, which rounds do not refresh; set "
+                         "num_rounds to 1")
     if kind != "continuous":
         raise ValueError(
             f"{model_dir} has tokenizer.kind {kind}; rounds refresh continuous models only: set num_rounds to 1, or "

@@ -99,7 +99,8 @@ class DeviceEnvironment(DeviceEpisodes):
             elsewhere it may not be set.
 
     Raises:
-        ValueError: a second model with another tokenizer, or with other tasks.
+        ValueError: a second model with another tokenizer, with other tasks, or of measured states, which the first
+            alone moves.
     """
 
     def __init__(
@@ -114,6 +115,9 @@ class DeviceEnvironment(DeviceEpisodes):
                 "imagined_environment.second_model has another tokenizer or other tasks than the world model; refresh "
                 "that model (model_refresh.num_rounds), or leave it empty"
             )
+        if second and spec.measured:
+            raise ValueError(f"imagined_environment.second_model predicts pictures, and {spec.task} has places in its "
+                             "state, which the world model alone predicts; leave it empty")
         self.tokenizer_sha256 = models.tokenizer_sha256
         self._fast, self._exact, self._fixed = has_fast_bfloat16(device), exact, fixed
         self._tokenizer = copy_in_bfloat16(models.tokenizer) if self._fast else models.tokenizer

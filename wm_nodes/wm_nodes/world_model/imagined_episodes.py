@@ -25,7 +25,7 @@ from wm_nodes.core.seeding import stream_seed
 from wm_nodes.core.specs import SOURCE_IMAGINED, EnvironmentSpec
 from wm_nodes.core.tool_control import CommandedMove, check_actions
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
-from wm_nodes.world_model.starts import start_of
+from wm_nodes.world_model.starts import starts_of
 
 
 @dataclass(frozen=True)
@@ -101,11 +101,11 @@ class DeviceEpisodes(ABC):
         put_where(valid, self.frames_NHWC, frames)
         put_where(valid, self.states_NP, moved)
         self.steps_N.add_(valid)
-        terminated = valid & (signal > self.reward.success_threshold)
-        over = self.steps_N >= self.spec.max_episode_steps
+        known = torch.ones_like(valid)
         if self.reward.uncertainty_limit > 0:
-            over = over | (spread > self.reward.uncertainty_limit)
-        truncated = valid & ~terminated & over
+            known = spread <= self.reward.uncertainty_limit
+        terminated = valid & known & (signal > self.reward.success_threshold)
+        truncated = valid & ~terminated & (~known | (self.steps_N >= self.spec.max_episode_steps))
         self._ended_N.logical_or_(terminated | truncated)
         return DeviceStep(terminated, truncated, valid, signal, spread)
 
@@ -134,7 +134,7 @@ class DeviceEpisodes(ABC):
 
 
 class ImaginedEpisodes:
-    """The NumPy face of imagined episodes. A reset with seed s begins at start_of(s, M), with the whole step limit.
+    """The NumPy face of imagined episodes. A reset with seed s begins at start s mod M, with the whole step limit.
 
     Args:
         seed: root of the stream `reset`, of which resets without seeds take theirs.
@@ -152,12 +152,11 @@ class ImaginedEpisodes:
     @torch.inference_mode()
     def reset(self, mask: BoolArray | None = None, seeds: UInt64Array | None = None) -> Observation:
         mask = np.ones(self.spec.num_envs, np.bool_) if mask is None else mask
-        starts = np.zeros(self.spec.num_envs, np.int64)
         for i in np.flatnonzero(mask):
             self._num_resets += 1
             self._seeds[i] = stream_seed(self._seed, "reset", self._num_resets) if seeds is None else seeds[i]
-            starts[i] = start_of(int(self._seeds[i]), self.episodes.num_starts)
             self._episode_ids[i] = self._num_resets
+        starts = starts_of(self._seeds, self.episodes.num_starts)
         self.episodes.reset(self._tensor(mask), self._tensor(starts))
         return self.current()
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from wm_nodes.config.tasks import parts_of, shares_scene
-from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Episode, FloatArray, UInt8Array, UInt64Array
 from wm_nodes.training.checkpoint import read_tensors
@@ -75,9 +75,9 @@ def load_start_seeds(path: Path, task: str = "") -> UInt64Array:
     return np.asarray(tensors["seeds"].numpy()[_rows(path, tensors, task)], np.uint64)
 
 
-def start_of(seed: int, num_starts: int) -> int:
-    """The start at which a reset with `seed` begins."""
-    return int(numpy_stream(seed, "start").integers(num_starts))
+def starts_of(seeds: UInt64Array, num_starts: int) -> NDArray[np.int64]:
+    """The starts at which resets with these seeds begin; those of M seeds in a row are all M, each once."""
+    return (seeds % np.uint64(num_starts)).astype(np.int64)
 
 
 def pack_instructions(episodes: Sequence[Episode]) -> Tensor:
