@@ -49,6 +49,12 @@ def judged(metrics: dict[str, float], config: RunConfig, imagined=(40, 100), rea
     return AcceptanceReport(config.task, 96, criteria, metrics, notes)
 
 
+def test_of_states_the_commanded_tool_is_not_judged() -> None:
+    criteria, notes = apply_criteria({**GOOD, "tool_ratio_h16": 0.9}, settings(), 16, (40, 100), (80, 200), told=True)
+    assert not any(row.name.startswith("tool") for row in criteria) and len(criteria) == 4
+    assert any(note.startswith("The tool's error is not judged") for note in notes)
+
+
 def test_a_model_within_every_limit_passes() -> None:
     report = judged(GOOD, settings())
     assert report.passed and not report.failed and len(report.criteria) == 5
@@ -204,8 +210,8 @@ def test_what_a_models_manifest_says_stands_in_for_a_measurement() -> None:
     scenes = load_config("cpu", {"task": "push"})
     found = accepted_when_made(read_world_manifest(shipped_model("push")), scenes)
     assert found.startswith("passed on 64 held-out episodes")
-    strict = scenes.with_values(acceptance=scenes.acceptance.with_values(tool_error_ratio=1e-3))
-    assert accepted_when_made(read_world_manifest(shipped_model("push")), strict).startswith("failed (tool error")
+    strict = scenes.with_values(acceptance=scenes.acceptance.with_values(object_error_ratio=1e-3))
+    assert accepted_when_made(read_world_manifest(shipped_model("push")), strict).startswith("failed (object error")
     assert accepted_when_made({}, config).startswith("not judged: the model's manifest holds no metrics")
 
 

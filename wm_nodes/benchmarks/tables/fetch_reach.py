@@ -1,7 +1,9 @@
 """Rows of the tables of docs/results/fetch_reach.md; what they are about stands in pages.yaml."""
 
+from collections.abc import Sequence
+
 from benchmarks.tables.own_data import FILE
-from benchmarks.tables.table import Rows, Run, lines, points, read, share
+from benchmarks.tables.table import Rows, Run, lines, percent, points, points_over_seeds, read, share
 
 
 def beside_control() -> Rows:
@@ -27,9 +29,13 @@ def _beside_control(name: str, its: list[Run]) -> tuple[str, ...]:
         share(*(sum(run[when][number] for run in its) for number in ("successes", "episodes")))
         for when in ("imagined_before", "imagined_after")
     )
-    before, after, control = (
-        [bool(won) for run in its for won in run[f"success_{when}"]] for when in ("before", "after", "control")
-    )
-    real = (share(sum(won), len(won)) for won in (before, after))
-    beside = (share(sum(control), len(control)), points(before, control)) if control else ("-", "-")
-    return name, *imagined, *real, points(before, after), *beside
+    before, after, control = ([run[f"success_{when}"] for run in its] for when in ("before", "after", "control"))
+    gain = points_over_seeds if len(its) > 1 else lambda first, last: points(first[0], last[0])
+    beside = (_share(control), gain(before, control)) if any(control) else ("-", "-")
+    return name, *imagined, _share(before), _share(after), gain(before, after), *beside
+
+
+def _share(runs: Sequence[Sequence[bool]]) -> str:
+    """Of all episodes; with an interval where they are of one run."""
+    won = [bool(one) for run in runs for one in run]
+    return share(sum(won), len(won)) if len(runs) == 1 else percent(sum(won) / len(won))

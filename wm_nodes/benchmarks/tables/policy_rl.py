@@ -3,7 +3,7 @@
 from collections import Counter
 from statistics import mean
 
-from benchmarks.tables.table import Rows, Run, lines, percent, points, read, share
+from benchmarks.tables.table import Rows, Run, lines, percent, points, points_over_seeds, read, share
 from wm_nodes.core.statistics import paired_difference, t_interval
 
 STUDY, ARMS = "policy_rl_seed_study.jsonl", "policy_rl_against_exploiting.json"
@@ -19,10 +19,10 @@ def push_cube() -> Rows:
             percent(rate(one["imagined_after"])), one["acceptance"]["outcome"],
         )
     whole = t_interval([100 * rate(one["real_after"]) for one in found])
-    first, last = ([x for one in found for x in one[f"success_{when}"]] for when in ("before", "after"))
+    first, last = ([one[f"success_{when}"] for one in found] for when in ("before", "after"))
     yield (
-        "push_cube", "all", percent(mean(first)), f"{whole.mean:.1f} [{whole.low:.1f}, {whole.high:.1f}]",
-        points(first, last), percent(mean(rate(one["imagined_after"]) for one in found)), "",
+        "push_cube", "all", percent(mean(map(mean, first))), f"{whole.mean:.1f} [{whole.low:.1f}, {whole.high:.1f}]",
+        points_over_seeds(first, last), percent(mean(rate(one["imagined_after"]) for one in found)), "",
     )
 
 
@@ -65,16 +65,17 @@ def simulator_control() -> Rows:
     rows = lines(STUDY)
     for task, last in (("push_cube", 2), ("push_cube", 4), ("reach", 4)):
         arms = ("world_model", "simulator") if last == 2 else ("world_model",)
-        pooled = {
-            (arm, when): [x for one in rows if (one["task"], one["model"]) == (task, arm) and one["seed"] <= last
-                          for x in one[f"success_{when}"]] for arm in arms for when in ("before", "after")
+        found = {
+            (arm, when): [one[f"success_{when}"] for one in sorted(rows, key=lambda one: int(one["seed"]))
+                          if (one["task"], one["model"]) == (task, arm) and one["seed"] <= last]
+            for arm in arms for when in ("before", "after")
         }
-        rates = {key: percent(mean(successes)) for key, successes in pooled.items()}
-        model, control = pooled["world_model", "after"], pooled.get(("simulator", "after"))
+        rates = {key: percent(mean(map(mean, successes))) for key, successes in found.items()}
+        model, control = found["world_model", "after"], found.get(("simulator", "after"))
         yield (
             task, f"0 to {last}", rates["world_model", "before"], rates["world_model", "after"],
-            points(pooled["world_model", "before"], model), rates.get(("simulator", "before"), ""),
-            rates.get(("simulator", "after"), ""), points(model, control) if control else "",
+            points_over_seeds(found["world_model", "before"], model), rates.get(("simulator", "before"), ""),
+            rates.get(("simulator", "after"), ""), points_over_seeds(model, control) if control else "",
         )
 
 
@@ -82,15 +83,16 @@ def against_exploiting() -> Rows:
     found = read(ARMS)["rows"]
     for arm in found:
         (shipped,) = [other for other in found if (other["task"], other["settings"]) == (arm["task"], "")]
-        real, usual = ([x for seed in of["seeds"] for x in seed["success_after"]] for of in (arm, shipped))
+        real, usual = ([seed["success_after"] for seed in of["seeds"]] for of in (arm, shipped))
         imagined = [seed["imagined_after"] for seed in arm["seeds"]]
         dreamt = sum(counts["successes"] for counts in imagined) / sum(counts["episodes"] for counts in imagined)
         updates = [list(readings) for readings in zip(*(seed["exploit_meter"] for seed in arm["seeds"]), strict=True)]
         calls = round(sum(one["imagined_success"] * one["episodes"] for one in updates[-1])) if updates else 0
         taken = [verdict["accepted"] for seed in arm["seeds"] for verdict in seed["refreshes"]]
         yield (
-            arm["task"], arm["arm"], percent(mean(real)), points(usual, real) if arm["settings"] else "",
-            percent(dreamt), f"{100 * (dreamt - mean(real)):.1f}",
+            arm["task"], arm["arm"], percent(mean(map(mean, real))),
+            points_over_seeds(usual, real) if arm["settings"] else "",
+            percent(dreamt), f"{100 * (dreamt - mean(map(mean, real))):.1f}",
             share(round(precision(updates[-1]) * calls), calls) if updates else "",
             ", ".join(percent(precision(readings)) for readings in updates),
             f"{sum(taken)} of {len(taken)}" if taken else "",

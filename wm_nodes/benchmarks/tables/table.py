@@ -3,13 +3,14 @@
 import json
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 import wm_nodes
-from wm_nodes.core.statistics import paired_difference, wilson_interval
+from wm_nodes.core.statistics import paired_difference, t_interval, wilson_interval
 
 ROOT = Path(wm_nodes.__file__).parents[1]
 DOCS, FILES = ROOT / "docs", ROOT / "benchmarks" / "results"
@@ -82,6 +83,19 @@ def points(before: Sequence[bool], after: Sequence[bool]) -> str:
     """The difference of two success rates on the same episodes, in points, with Tango's interval."""
     pair = paired_difference(before, after)
     return interval(100 * pair.difference, 100 * pair.low, 100 * pair.high, 1)
+
+
+def over_seeds(changes: Sequence[float], digits: int = 1) -> str:
+    """The mean of one change a seed, with Student's t interval over them; without one of a single seed."""
+    if len(changes) < 2:
+        return f"{changes[0]:+.{digits}f}"
+    found = t_interval(changes)
+    return interval(found.mean, found.low, found.high, digits)
+
+
+def points_over_seeds(before: Iterable[Sequence[bool]], after: Iterable[Sequence[bool]]) -> str:
+    """The differences of two success rates of each seed, in points, as over_seeds."""
+    return over_seeds([100 * (mean(new) - mean(old)) for old, new in zip(before, after, strict=True)])
 
 
 def share(count: float, n: int) -> str:

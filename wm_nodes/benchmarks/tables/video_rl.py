@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from itertools import groupby
 from statistics import mean, median
 
-from benchmarks.tables.table import Rows, Run, interval, lines, percent, read
+from benchmarks.tables.table import Rows, Run, interval, lines, over_seeds, percent, read
 from benchmarks.video_rl.comparison import gains
 from wm_nodes.core.statistics import bootstrap_mean, t_interval
 
@@ -53,13 +53,6 @@ def learning() -> Rows:
 def gained(trained: Sequence[Run], measures: Sequence[tuple[str, int]]) -> list[str]:
     """Change of each measure over a training, with its interval over the seeds; of one seed the change alone."""
     return [over_seeds([course[-1] for course in gains(trained, name)], digits) for name, digits in measures]
-
-
-def over_seeds(changes: Sequence[float], digits: int) -> str:
-    if len(changes) < 2:
-        return f"{changes[0]:+.{digits}f}"
-    found = t_interval(changes)
-    return interval(found.mean, found.low, found.high, digits)
 
 
 def compared(comparison: Run, measures: Sequence[tuple[str, int]]) -> list[str]:
@@ -121,10 +114,11 @@ def resolution() -> Rows:
 
 def hacking() -> Rows:
     for name, trained in samplers(read("video_rl_hacking.json")["rows"]).items():
-        alarms = sum(bool({"obeyed", "mass"} & set(one["hacked"])) for one in trained)
+        worse = ({"obeyed", "mass"}, {"background"})
+        alarms = [sum(bool(truths & set(one["hacked"])) for one in trained) for truths in worse]
         ends = [one["evaluations"][-1] for one in trained]
         after = (", ".join(f"{end[key]:.2f}" for end in ends) for key in ("consistency", "obeyed", "mass"))
-        yield name, *after, f"{alarms} of {len(trained)}"
+        yield name, *after, *(f"{count} of {len(trained)}" for count in alarms)
 
 
 def as_written() -> Rows:

@@ -2,8 +2,8 @@
 
 from statistics import mean
 
-from benchmarks.tables.table import Rows, Run, interval, lines, percent, points, read, runs
-from benchmarks.tables.video_rl import gained, over_seeds, samplers
+from benchmarks.tables.table import Rows, Run, interval, lines, over_seeds, percent, points, read, runs
+from benchmarks.tables.video_rl import gained, samplers
 from benchmarks.video_rl.comparison import compare_samplers
 
 OUTCOME, EARLY, REWARDS = (f"video_rl_outcome{of}.json" for of in ("", "_early", "_rewards"))

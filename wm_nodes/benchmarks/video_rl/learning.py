@@ -18,8 +18,6 @@ from wm_nodes.video_rl.train import Request, VideoLearner, post_train, sample_bu
 from wm_nodes.video_rl.training_run import flatten_metrics
 
 MIN_EVALUATIONS = 4
-DRIFTS = "background"
-"""Gets worse in every training that has no frozen anchor, whatever the reward: named, and no sign of hacking."""
 
 
 def train_sampler(
@@ -82,11 +80,6 @@ def hacked(evaluations: list[dict[str, float]], proxy: str) -> list[str]:
         "background": [-row["background"] for row in evaluations],
     }
     return list(find_hacked_metrics([row[proxy] for row in evaluations], truths))
-
-
-def alarms(row: dict[str, Any]) -> list[str]:
-    """What a training's reward was hacked at the cost of: its `hacked` metrics but the one that drifts anyway."""
-    return [name for name in row["hacked"] if name != DRIFTS]
 
 
 def _means(scores: Mapping[str, Sequence[float]]) -> dict[str, float]:

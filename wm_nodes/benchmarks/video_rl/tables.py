@@ -7,7 +7,6 @@ import numpy as np
 from rich.table import Table
 
 from benchmarks.video_rl.comparison import GAINS, SamplerComparison, gains
-from benchmarks.video_rl.learning import alarms
 from wm_nodes.core.statistics import MeanInterval, bootstrap_mean, t_interval
 from wm_nodes.reports.console_table import estimate, make_table
 
@@ -132,7 +131,7 @@ def hacking_table(rows: Sequence[dict[str, Any]]) -> Table:
     for row in rows:
         first, last, proxy = row["evaluations"][0], row["evaluations"][-1], row["plan"]["proxy"]
         shown = (f"{first[name]:.4g} -> {last[name]:.4g}" for name in (proxy, "obeyed", "mass", "background"))
-        cells.append((row["sampler"], row["seed"], *shown, ", ".join(alarms(row)) or "no alarm"))
+        cells.append((row["sampler"], row["seed"], *shown, ", ".join(row["hacked"]) or "no alarm"))
     return _table(
         "reward hacking (DD-2), held-out scenes", ("trained on",),
         ("seed", "that reward", "obeyed", "mass", "background", "falls while it rises"), cells,

@@ -94,7 +94,8 @@ def accept_world_model(
     config = config if config.task else config.model_copy(update={"task": models.spec.task})
     _check(models, heldout, config.task)
     metrics = model_metrics(models, heldout, config)
-    criteria, notes = apply_criteria(metrics, config, heldout.num_steps, imagined, real, clone)
+    told = _sees_states(models, config)
+    criteria, notes = apply_criteria(metrics, config, heldout.num_steps, imagined, real, clone, told=told)
     if config.reward.dense_weight > 0 and models.text is not None:
         for part in parts_of(config.task):
             goals = goal_metrics(models, heldout, config, part)
@@ -105,14 +106,18 @@ def accept_world_model(
 
 def apply_criteria(
     metrics: Mapping[str, float | None], config: RunConfig, num_steps: int, imagined: tuple[int, int] | None,
-    real: tuple[int, int] | None, clone: CloneRollouts | None = None,
+    real: tuple[int, int] | None, clone: CloneRollouts | None = None, *, told: bool = False,
 ) -> tuple[tuple[Criterion, ...], tuple[str, ...]]:
-    """Return criteria and notes from the metrics of rollouts of up to num_steps steps; see accept_world_model."""
+    """Return criteria and notes from the metrics of rollouts of up to num_steps steps; see accept_world_model.
+
+    Args:
+        told: positions are those of states, of the tool the commanded ones, which no model predicts.
+    """
     limits, task = config.acceptance, config.task
     has_positions = _has_positions(metrics)
     near_misses, successes = MORE_NEAR_MISSES, MORE_SUCCESSES
     if has_positions:
-        criteria, notes = _position_criteria(metrics, config, num_steps)
+        criteria, notes = _position_criteria(metrics, config, num_steps, told)
     else:
         criteria, notes = [], ["Positions were not judged: no ground truth names them."]
         near_misses, successes = RECORDED_NEAR_MISSES, RECORDED_SUCCESSES
@@ -173,9 +178,10 @@ def _picture_criteria(
 
 
 def _position_criteria(
-    metrics: Mapping[str, float | None], config: RunConfig, num_steps: int
+    metrics: Mapping[str, float | None], config: RunConfig, num_steps: int, told: bool
 ) -> tuple[list[Criterion], list[str]]:
     """Criteria and notes of the errors of positions after num_steps steps."""
+    things = {*judged_things(config.task)} - ({"tool"} if told else set())
     limits, task, criteria = config.acceptance, config.task, list[Criterion]()
     notes = [
         f"Errors are those of the full horizon over those of copying the first frame; the object's over the episodes "
@@ -183,12 +189,14 @@ def _position_criteria(
         f"{at_step(metrics, 'object_floor_cm', num_steps):.2f} cm (object) and "
         f"{at_step(metrics, 'tool_floor_cm', num_steps):.2f} cm (tool) on real frames."
     ]
-    if "object" not in judged_things(task):
-        notes.append(f"The object hardly moves in {task}, so its error is not judged; the tool's is.")
+    if "object" not in things:
+        notes.append(f"The object hardly moves in {task}, so its error is not judged.")
+    if told:
+        notes.append("The tool's error is not judged: its place is the commanded one, which no model predicts.")
     for name, key, limit in (
         ("object", "object_moved_ratio", limits.object_error_ratio), ("tool", "tool_ratio", limits.tool_error_ratio),
     ):
-        if name in judged_things(task):
+        if name in things:
             ratio, *ends = (at_step(metrics, f"{key}{end}", num_steps) for end in ("", "_low", "_high"))
             criteria.append(_below(f"{name} error / copying, step {num_steps}", ratio, limit, _interval(*ends)))
     return criteria, notes
@@ -219,7 +227,8 @@ def report_when_made(
         of_policy, left_out = _policy_criteria(config, imagined, real, None)
         note = f"the model's manifest holds no metrics of held-out episodes of {task}"
         return AcceptanceReport(task, 0, tuple(of_policy), {}, (note, *left_out))
-    criteria, notes = apply_criteria(metrics, config, steps, imagined, real)
+    told = config.policy.inputs == "state" and bool(manifest.get("world_model", {}).get("state_model_iterations"))
+    criteria, notes = apply_criteria(metrics, config, steps, imagined, real, told=told)
     if config.reward.dense_weight > 0 and "goal_episodes" in metrics:
         criteria = (*criteria, *_goals({name: number_of(value) for name, value in metrics.items()}, config, task))
     if manifest.get("success_threshold") != config.reward.success_threshold:
