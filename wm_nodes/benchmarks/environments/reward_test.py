@@ -39,7 +39,7 @@ from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.text import ImaginedGoals, imagine_goals
 from wm_nodes.world_model.validation.open_loop import BATCH, ImaginedEpisodes, imagine
 
-JUDGE = "reward agent"
+JUDGE, DONE_VALUE = "reward agent", "done signal, its largest value"
 EMPTY_HAND = "no_grasp"
 """The behaviour that moves like a demonstration and never closes the gripper."""
 BEHAVIOURS = {"expert": 0.4, EMPTY_HAND: 0.2, "noisy": 0.15, "near_miss": 0.15, "short": 0.1}
@@ -86,6 +86,7 @@ def measure_rewards(config: RunConfig, model_dir: Path, learned_from: int, work:
         found = imagined_episodes(config, models, domain, HELDOUT.take(episodes), episodes, work)
         goals = goals_of(models, found.real, config)
         scored = paid(found, goals, model_dir, config) | {name: head(found) for name, head in heads.items()}
+        scored[DONE_VALUE] = largest(found.signals.astype(np.float64), found)
         scored[JUDGE] = judged(found, config)
         for name, values in scored.items():
             yield {"task": config.task, "domain": domain, "reward": name, **judge_reward(values, found, config.seed)}

@@ -9,10 +9,8 @@ files list the tasks too. Shapes: P ground truth, A action, S state.
 from __future__ import annotations
 
 import functools
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib import resources
 from typing import TYPE_CHECKING, Any, Literal
 
 from wm_nodes.config.extensions import find_files, load_file
@@ -144,12 +142,6 @@ class Task:
 def task_names() -> tuple[str, ...]:
     """Every known task, sorted."""
     return tuple(sorted(_files()))
-
-
-def default_task() -> str:
-    """The task of base.yaml, which launch files read without a YAML package."""
-    text = resources.files("wm_nodes.config").joinpath("presets/policy/base.yaml").read_text(encoding="utf-8")
-    return str(re.findall(r"^task: (\w+)$", text, re.MULTILINE)[0])
 
 
 def check_task(name: str) -> str:
