@@ -1,15 +1,20 @@
-"""Answers of action servers that are lost, on a real wire."""
+"""Answers that are lost or late, on a real wire."""
 
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
-from graph.harness import Probe, wait_until
+from graph.harness import Graph, Probe, wait_until
+from graph.toy import HOMING_S
 from rclpy.action import ActionServer
 
 from wm_msgs.action import Train
-from wm_nodes.ros.clients import goal_result
+from wm_msgs.msg import EpisodeEvent
+from wm_msgs.srv import GetEnvSpec
+from wm_nodes.nodes.environment.remote_environment import remote_environments
+from wm_nodes.ros.goals import goal_result
 from wm_nodes.ros.wire import PeerLost
 
 pytestmark = pytest.mark.graph
@@ -71,3 +76,25 @@ def test_a_server_that_has_forgotten_the_goal_gives_an_error_and_not_an_empty_re
     with pytest.raises(PeerLost, match="train does not know the goal it accepted; was its node restarted"):
         goal_result(handle, 30.0, lambda: None)
     server.destroy()
+
+
+@pytest.mark.slow
+def test_a_reset_longer_than_half_its_deadline_is_made_once_and_answered(
+    graph: Graph, probe: Probe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    events = probe.listen("episode")
+    graph.start_environment("toy:make_homing_environment", num_envs=2)
+    asked = GetEnvSpec.Request()
+    wait_until("an environment", lambda: probe.call(GetEnvSpec, "env/get_spec", asked).error_code == 0)
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
+    with remote_environments("caller", graph.folder, ("",), lambda: None, timeout_s=1.6 * HOMING_S) as (environment,):
+        for seed in (7, 7):
+            reset = environment.reset(seeds=np.full(2, seed, np.uint64))
+            stepped = environment.step(np.zeros((2, 3), np.float32))
+            assert stepped.observation.episode_id.tolist() == reset.episode_id.tolist() and stepped.valid.all()
+    wait_until("the last episodes", lambda: {3, 4} <= {event.episode_id for event in events if started(event)})
+    assert [event.episode_id for event in events if started(event)] == [1, 2, 3, 4]
+
+
+def started(event: EpisodeEvent) -> bool:
+    return bool(event.kind == EpisodeEvent.KIND_START)

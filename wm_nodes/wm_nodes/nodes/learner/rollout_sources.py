@@ -21,7 +21,8 @@ from wm_nodes.nodes.learner.rollout_assembler import RolloutAssembler
 from wm_nodes.policy_rl.rollouts import TensorRollout
 from wm_nodes.policy_rl.training_run import Progress
 from wm_nodes.recording import BagReport, read_rollouts, topics
-from wm_nodes.ros.clients import Check, run_goal, same_process
+from wm_nodes.ros.clients import Check
+from wm_nodes.ros.goals import run_goal, same_process
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.wire import PeerLost
 from wm_nodes.ros.worker import Work
