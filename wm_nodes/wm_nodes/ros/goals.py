@@ -86,8 +86,29 @@ def goal_result(handle: Any, timeout_s: float, check: Check) -> Any:
     return response.result
 
 
+class _KeptErrors:
+    """Calls a callback for the executor, and keeps what it raises for the thread that waits: an exception out of a
+    callback ends the process under rclpy's EventsExecutor (SIGSEGV). After one the callback is not called again."""
+
+    def __init__(self, callback: Callable[[Any], object]) -> None:
+        self._callback = callback
+        self._error: Exception | None = None
+
+    def __call__(self, message: Any) -> None:
+        try:
+            if self._error is None:
+                self._callback(message)
+        except Exception as error:  # raised again by check()
+            self._error = error
+
+    def check(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+
 def run_goal(
-    client: ActionClient, goal: Any, *, accept_s: float, check: Check, alive: Check, on_feedback: Any = None
+    client: ActionClient, goal: Any, *, accept_s: float, check: Check, alive: Check,
+    on_feedback: Callable[[Any], object] = lambda message: None,
 ) -> Any:
     """Send an action goal from a worker thread and wait for its result.
 
@@ -96,6 +117,7 @@ def run_goal(
         check: raises Cancelled when the caller must stop; the goal is then cancelled too, also one that was sent and is
             accepted only later.
         alive: raises PeerLost when the server is known to be gone.
+        on_feedback: called in the executor's thread. What it raises is raised here, and the goal is cancelled.
 
     Raises:
         PeerLost: no server, no acceptance, a refusal for accept_s, or a lost server.
@@ -104,14 +126,17 @@ def run_goal(
     wait_until(client.server_is_ready, accept_s, check, name)
     deadline = time.monotonic() + accept_s
 
+    feedback = _KeptErrors(on_feedback)
+
     def both() -> None:
         check()
+        feedback.check()
         alive()
 
     sent: list[Future] = []
 
     def send() -> Future:
-        sent.append(client.send_goal_async(goal, feedback_callback=on_feedback))
+        sent.append(client.send_goal_async(goal, feedback_callback=feedback))
         return sent[-1]
 
     while True:
@@ -125,6 +150,7 @@ def run_goal(
         if handle.accepted:
             try:
                 result = goal_result(handle, float("inf"), both)
+                feedback.check()
             except BaseException:
                 node.executor.create_task(handle.cancel_goal_async)
                 raise
