@@ -30,8 +30,8 @@ from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.errors import WireError
 from wm_nodes.core.files import write_atomic
-from wm_nodes.ros.clients import goal_result
 from wm_nodes.ros.endpoint_matching import EndpointTable
+from wm_nodes.ros.goals import goal_result
 from wm_nodes.ros.qos import topic
 
 DOMAINS = range(20, 60)

@@ -1,15 +1,24 @@
-"""Answers of action servers that are lost, on a real wire."""
+"""Answers that are lost or late, on a real wire."""
 
+import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
-from graph.harness import Probe, wait_until
-from rclpy.action import ActionServer
+from deadlines import PATIENCE_S
+from graph.harness import Graph, Probe, wait_until
+from graph.toy import HOMING_S
+from rclpy.action import ActionServer, CancelResponse
 
 from wm_msgs.action import Train
-from wm_nodes.ros.clients import goal_result
+from wm_msgs.msg import EpisodeEvent
+from wm_msgs.srv import GetEnvSpec
+from wm_nodes.launching.graph_client import GraphClient
+from wm_nodes.nodes.environment.remote_environment import remote_environments
+from wm_nodes.ros.goals import goal_result
 from wm_nodes.ros.wire import PeerLost
 
 pytestmark = pytest.mark.graph
@@ -71,3 +80,65 @@ def test_a_server_that_has_forgotten_the_goal_gives_an_error_and_not_an_empty_re
     with pytest.raises(PeerLost, match="train does not know the goal it accepted; was its node restarted"):
         goal_result(handle, 30.0, lambda: None)
     server.destroy()
+
+
+class TellingServer(ActionServer):
+    """Tells feedback until its goal is cancelled."""
+
+    def __init__(self, node: Any) -> None:
+        super().__init__(
+            node, Train, "train", lambda goal: Train.Result(), handle_accepted_callback=self._begin,
+            cancel_callback=lambda goal: CancelResponse.ACCEPT,
+        )
+        self.canceled = threading.Event()
+
+    def _begin(self, goal: Any) -> None:
+        threading.Thread(target=self._tell, args=(goal,)).start()
+
+    def _tell(self, goal: Any) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        while not goal.is_cancel_requested and time.monotonic() < deadline:
+            goal.publish_feedback(Train.Feedback(update=1))
+            time.sleep(0.02)
+        if goal.is_cancel_requested:
+            self.canceled.set()
+        goal.execute()
+
+
+def test_what_a_callback_of_feedback_raises_ends_the_goal_and_reaches_the_caller(
+    domain: int, other: Probe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    server = TellingServer(other.node)
+    told = list[Any]()
+
+    def show(feedback: Any) -> None:
+        told.append(feedback)
+        raise BrokenPipeError("nobody reads")
+
+    with GraphClient() as client, pytest.raises(BrokenPipeError, match="nobody reads"):
+        client.train(5, show)
+    assert server.canceled.wait(PATIENCE_S) and len(told) == 1
+    server.destroy()
+
+
+@pytest.mark.slow
+def test_a_reset_longer_than_half_its_deadline_is_made_once_and_answered(
+    graph: Graph, probe: Probe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    events = probe.listen("episode")
+    graph.start_environment("toy:make_homing_environment", num_envs=2)
+    asked = GetEnvSpec.Request()
+    wait_until("an environment", lambda: probe.call(GetEnvSpec, "env/get_spec", asked).error_code == 0)
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
+    with remote_environments("caller", graph.folder, ("",), lambda: None, timeout_s=1.6 * HOMING_S) as (environment,):
+        for seed in (7, 7):
+            reset = environment.reset(seeds=np.full(2, seed, np.uint64))
+            stepped = environment.step(np.zeros((2, 3), np.float32))
+            assert stepped.observation.episode_id.tolist() == reset.episode_id.tolist() and stepped.valid.all()
+    wait_until("the last episodes", lambda: {3, 4} <= {event.episode_id for event in events if started(event)})
+    assert [event.episode_id for event in events if started(event)] == [1, 2, 3, 4]
+
+
+def started(event: EpisodeEvent) -> bool:
+    return bool(event.kind == EpisodeEvent.KIND_START)

@@ -149,6 +149,22 @@ def make_environment_with_a_lost_camera(config: RunConfig, num_envs: int, seed: 
     return LostHand(num_envs, seed)
 
 
+HOMING_S = 2.6
+"""One reset of make_homing_environment."""
+
+
+class Homing(ReachToy):
+    """Takes HOMING_S for each reset, as a robot that drives home."""
+
+    def reset(self, mask: BoolArray | None = None, seeds: UInt64Array | None = None) -> Observation:
+        time.sleep(HOMING_S)
+        return super().reset(mask, seeds)
+
+
+def make_homing_environment(config: RunConfig, num_envs: int, seed: int) -> Homing:
+    return Homing(num_envs, seed)
+
+
 class Faulty(ReachToy):
     """What goes wrong once: `nan` state, `raise` in the first step, `compute` for COMPUTING_S in the 20th step, or
     `goals` that raise in the second reset."""

@@ -103,6 +103,61 @@ def test_loop_2_goes_on_with_its_recordings_and_rewards(tmp_path: Path) -> None:
     assert "is a run of 'train-video-model', not of 'train-policy'" in refused(run)
 
 
+def model_in(folder: Path, text: str = "{}") -> Path:
+    folder.mkdir()
+    (folder / "manifest.json").write_text(text)
+    return folder
+
+
+def test_a_moved_model_is_given_anew_and_another_one_refused(tmp_path: Path) -> None:
+    run, model = ["--run-dir", tmp_path / "run"], model_in(tmp_path / "model")
+    _, config = opened([*BEGINNING, "--model-dir", model, *run])
+    moved, other = model.rename(tmp_path / "moved"), model_in(tmp_path / "other", '{"sha256": {}}')
+    assert f"{model} holds no manifest.json; name the folder of a trained world model with --model-dir" in refused(run)
+    text = refused(["--model-dir", other, *run])
+    assert f"--model-dir is '{model}' in this run, '{other}' is given (which holds something else)" in text
+    assert "--model-dir is" in refused(["--model-dir", tmp_path / "nothing", *run])
+    again, same = opened(["--model-dir", moved, *run])
+    assert again["model_dir"] == str(moved) and same == config
+    assert opened(run)[0]["model_dir"] == str(moved), "the record has the new path"
+    (tmp_path / "model").symlink_to(moved)
+    assert opened(["--model-dir", model, *run])[0]["model_dir"] == str(moved), "a link is what it leads to"
+
+
+def test_a_record_without_contents_goes_on_where_the_old_path_leads_to_what_was_moved(tmp_path: Path) -> None:
+    run, model = ["--run-dir", tmp_path / "run"], model_in(tmp_path / "model")
+    opened([*BEGINNING, "--model-dir", model, *run])
+    file = tmp_path / "run" / "config.yaml"
+    values = yaml.safe_load(file.read_text())
+    assert set(values["run"].pop("contents")) == {str(model)}
+    file.write_text(yaml.safe_dump(values, sort_keys=False))
+    moved = model.rename(tmp_path / "moved")
+    assert f"(nobody knows what {model} held: if it was moved, link it there" in refused(["--model-dir", moved, *run])
+    model.symlink_to(moved)
+    opened(run)
+    model.unlink()
+    assert opened(["--model-dir", moved, *run])[0]["model_dir"] == str(moved)
+
+
+def test_moved_demonstrations_are_given_anew_and_others_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train_policy, "read_spec", lambda path: None)
+    run, bags = ["--run-dir", tmp_path / "run"], [tmp_path / "a", tmp_path / "b"]
+    for bag in bags:
+        bag.mkdir()
+        (bag / "metadata.yaml").write_text(bag.name)
+    opened([*BEGINNING, "--demos", *bags, *run])
+    a, b = (bag.rename(tmp_path / f"moved_{bag.name}") for bag in bags)
+    assert f"{bags[0]} does not exist; name the recordings with --demos" in refused(run)
+    assert "--demos is" in refused(["--demos", a, *run])
+    assert "(which holds something else)" in refused(["--demos", b, a, *run])
+    assert "--ppo.updates is 3 in this run, 4 is given" in refused(["--demos", a, b, "--ppo.updates", "4", *run])
+    _, config = opened(["--demos", a, b, *run])
+    assert yaml.safe_load(config)["sft"]["bags"] == [str(a), str(b)]
+    assert opened(run)[1] == config, "the record has the new paths"
+
+
 def test_one_file_holds_the_settings_and_the_options_and_its_settings_are_those_of_the_run(tmp_path: Path) -> None:
     _, config = opened([*BEGINNING, "--run-dir", tmp_path / "run"])
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["config.yaml"]

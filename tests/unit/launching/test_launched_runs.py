@@ -67,6 +67,23 @@ def test_a_run_that_was_moved_goes_on_with_its_own_files(tmp_path: Path, model: 
     assert str(run) + "/" not in (moved / "config.yaml").read_text(encoding="utf-8")
 
 
+def test_files_that_were_moved_are_given_anew_and_others_refused(tmp_path: Path, model: str) -> None:
+    weak = tmp_path / "weak.safetensors"
+    weak.write_bytes(b"weak")
+    begun = {"preset": "smoke", "model_dir": model, "initial_policy": str(weak)}
+    launch_arguments.begin("online_training", {**run_in(tmp_path), **begun})
+    moved, other = Path(model).rename(tmp_path / "moved"), tmp_path / "other.safetensors"
+    other.write_bytes(b"other")
+    with pytest.raises(ValueError, match="as model_dir:=, also where this run's was moved"):
+        launch_arguments.begin("online_training", run_in(tmp_path))
+    anew = {"model_dir": str(moved), "initial_policy": str(weak.rename(tmp_path / "moved.safetensors"))}
+    assert "initial_policy is" in refused("online_training", {**run_in(tmp_path), **anew, "initial_policy": str(other)})
+    _, values = launch_arguments.begin("online_training", {**run_in(tmp_path), **anew})
+    assert values["starts_file"] == str(moved / "starts.safetensors")
+    _, again = launch_arguments.begin("online_training", run_in(tmp_path))
+    assert {name: again[name] for name in anew} == anew
+
+
 def test_given_arguments_that_differ_are_named_and_nothing_is_touched(tmp_path: Path, model: str) -> None:
     begun = {"preset": "smoke", "model_dir": model, "num_envs": "6", "reward": "agent", "judge": "http://a/v1",
              "judge_model": "judge"}

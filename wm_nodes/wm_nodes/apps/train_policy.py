@@ -197,7 +197,10 @@ def _load(file: str, settings: dict[str, Any], chosen: Mapping[str, Any]) -> Run
 def _check(arguments: argparse.Namespace, config: RunConfig) -> None:
     compute_device(config.device)
     if arguments.model_dir and not Path(arguments.model_dir, MANIFEST).is_file():
-        raise ConfigError(f"{arguments.model_dir} holds no {MANIFEST}; name the folder of a trained world model")
+        raise ConfigError(
+            f"{arguments.model_dir} holds no {MANIFEST}; name the folder of a trained world model with "
+            "--model-dir, also where this run's was moved"
+        )
     if not config.task:
         _check_without_task(arguments, config)
     elif arguments.from_scratch:
@@ -208,6 +211,10 @@ def _check(arguments: argparse.Namespace, config: RunConfig) -> None:
         check_model(spec, model_dir, model_spec(model_dir, read_world_manifest(model_dir)))
         check_inputs(config, spec)
     for bag in config.sft.bags:
+        if not Path(bag).exists():
+            raise ConfigError(
+                f"{bag} does not exist; name the recordings with --demos, also where this run's were moved"
+            )
         read_spec(Path(bag))
     if config.model_refresh.num_rounds > 1 and not is_simulated(config):
         raise ConfigError(f"model_refresh.num_rounds is {config.model_refresh.num_rounds}, and rounds collect in the "
@@ -244,6 +251,11 @@ def _check_environment(arguments: argparse.Namespace, config: RunConfig) -> None
     if (arguments.environment == "video_model") != bool(arguments.video_model):
         raise ConfigError("--environment video_model and --video-model DIR go together; give both, or none")
     if arguments.video_model:
+        if not Path(arguments.video_model, MANIFEST).is_file():
+            raise ConfigError(
+                f"{arguments.video_model} holds no {MANIFEST}; name the folder of a trained video model with "
+                "--video-model, also where this run's was moved"
+            )
         load_steppable(config, Path(arguments.video_model))
         if (rounds := config.model_refresh.num_rounds) > 1:
             raise ConfigError(

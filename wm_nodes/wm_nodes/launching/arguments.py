@@ -186,7 +186,10 @@ def _resolve(scenario: str, values: Mapping[str, str], config: RunConfig | Video
 def _model_dir(given: str, task: str) -> str:
     if given:
         if not Path(given, "manifest.json").is_file():
-            raise GraphError(f"model_dir {given!r} holds no manifest.json; give the folder of a trained world model")
+            raise GraphError(
+                f"model_dir {given!r} holds no manifest.json; give the folder of a trained world model as model_dir:=, "
+                "also where this run's was moved"
+            )
         return given
     try:
         return str(shipped_model(task))

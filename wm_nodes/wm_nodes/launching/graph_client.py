@@ -13,7 +13,7 @@ from wm_msgs.action import Evaluate, Rollout, Train, TrainVideo
 from wm_msgs.msg import RunState
 from wm_nodes.core.errors import RunError
 from wm_nodes.core.types import BoolArray
-from wm_nodes.ros.clients import run_goal, same_process
+from wm_nodes.ros.goals import run_goal, same_process
 from wm_nodes.ros.liveliness import HEARTBEAT_S, PeerWatch, activities_here
 from wm_nodes.ros.params import PEER_TIMEOUT_S
 from wm_nodes.ros.qos import topic

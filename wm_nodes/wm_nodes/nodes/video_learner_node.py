@@ -19,8 +19,8 @@ from wm_nodes.nodes.clip_evaluator_node import read_buffer
 from wm_nodes.nodes.learner.training_node import TrainingNode
 from wm_nodes.ros import diagnostics
 from wm_nodes.ros.actions import GuardedActionClient
-from wm_nodes.ros.clients import run_goal, same_process
 from wm_nodes.ros.endpoint_matching import StartBarrier
+from wm_nodes.ros.goals import run_goal, same_process
 from wm_nodes.ros.params import COMMON, Param, named_files
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import PeerLost

@@ -1,4 +1,4 @@
-"""Calls from worker threads, each with a deadline; and the environment as a remote or a local one."""
+"""Service calls from worker threads, each with a deadline; and the environment as a remote or a local one."""
 
 import threading
 import time
@@ -6,8 +6,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from action_msgs.msg import GoalStatus
-from rclpy.action import ActionClient
 from rclpy.client import Client
 from rclpy.task import Future
 
@@ -16,7 +14,6 @@ from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
 from wm_nodes.core.errors import WireError
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.ros import calls, convert
-from wm_nodes.ros.liveliness import PeerWatch
 from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand
 
 if TYPE_CHECKING:
@@ -26,18 +23,16 @@ POLL_S = 0.1
 """How often a waiting thread looks whether it must stop."""
 
 ATTEMPT_S = 2.0
-"""A step request without an answer is sent again after this time; the environment answers the same step_id once."""
+"""A step request without an answer is sent again after this time; the environment makes the same step_id once."""
+
+SENT_AGAIN_S = 1.0
+"""Longest wait for the answers to a request that was sent again and is answered already."""
 
 SILENT_S = 8.0
 """An environment that was silent for so long is not asked any more. A crowded machine can keep one quiet for longer
 than the time after which it is reported (seen on 2026-11-23 while it drew four simulators), and it answers then."""
 
 BUSY_WAIT_S = 0.005
-
-LOST_S = 2.0
-"""A result that has not arrived so long after the end of its goal is asked for again."""
-
-ENDED = (GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED)
 
 Check = Callable[[], None]
 
@@ -46,11 +41,12 @@ def wait_for(future: Future, timeout_s: float, check: Check) -> Any:
     """Wait in a worker thread for a future that the executor completes. Raises PeerLost: not done after timeout_s."""
     done = threading.Event()
     future.add_done_callback(lambda _: done.set())
-    _wait(done, timeout_s, check, f"no answer within {timeout_s:g} s")
+    wait_event(done, timeout_s, check, f"no answer within {timeout_s:g} s")
     return future.result()
 
 
-def _wait(done: threading.Event, timeout_s: float, check: Check, text: str) -> None:
+def wait_event(done: threading.Event, timeout_s: float, check: Check, text: str) -> None:
+    """Wait in a worker thread. Raises PeerLost(text) after timeout_s."""
     deadline = time.monotonic() + timeout_s
     while not done.wait(min(POLL_S, max(0.0, deadline - time.monotonic()))):
         check()
@@ -78,6 +74,43 @@ def call(client: Client, request: Any, timeout_s: float, check: Check = lambda: 
     finally:
         if not future.done():
             client.remove_pending_request(future)
+
+
+class RepeatedCall:
+    """A service call that may be sent several times; whichever answer comes first counts. For a worker thread."""
+
+    def __init__(self, client: Client, request: Any) -> None:
+        self._client, self._request = client, request
+        self._waiting: list[Future] = []
+
+    def ask(self, timeout_s: float, check: Check) -> Any:
+        """Send the request, once more where it was sent before. Raises PeerLost after timeout_s without an answer; one
+        that comes later is the answer to the next ask()."""
+        answered = threading.Event()
+        self._waiting.append(self._client.call_async(self._request))
+        for future in self._waiting:
+            future.add_done_callback(lambda _: answered.set())
+        wait_event(answered, timeout_s, check, f"{self._client.srv_name}: no answer within {timeout_s:g} s")
+        first = next(future for future in self._waiting if future.done())
+        self._forget(self._waiting.index(first) + 1)
+        return first.result()
+
+    def await_rest(self) -> None:
+        """Wait for the answers to what was sent after the answered one, SENT_AGAIN_S at most: the server then takes
+        none of it after what is sent next."""
+        deadline = time.monotonic() + SENT_AGAIN_S
+        while any(not future.done() for future in self._waiting) and time.monotonic() < deadline:
+            time.sleep(BUSY_WAIT_S)
+
+    def end(self) -> None:
+        """Wait for no answer any more."""
+        self._forget(len(self._waiting))
+
+    def _forget(self, count: int) -> None:
+        for future in self._waiting[:count]:
+            if not future.done():
+                self._client.remove_pending_request(future)
+        self._waiting = self._waiting[count:]
 
 
 class RosEnvironmentClient:
@@ -129,8 +162,8 @@ class RosEnvironmentClient:
         return self._spec
 
     def reset(self, command: ResetCommand, check: Check) -> Reply:
-        # Twice the same reset gives the same observation; a server that has not matched this client's reader yet loses
-        # its first answer (rmw_fastrtps 556).
+        # Sent again at half the time: a server that has not matched this client's reader yet loses its first answer
+        # (rmw_fastrtps 556). Where it was slow instead, the environment answers the repeat as it did the first.
         read = partial(calls.reply_of, spec=self._require_spec())
         reply = self._ask(self._reset, calls.reset_request(command), read, self._timeout_s / 2, check)
         if reply.session != self._session:
@@ -163,7 +196,7 @@ class RosEnvironmentClient:
 
         def attempt(left_s: float) -> Reply:
             try:
-                response = call(client, request, min(left_s, attempt_s), check_alive)
+                response = repeated.ask(min(left_s, attempt_s), check_alive)
             except PeerLost:
                 if left_s <= attempt_s or self._is_silent:
                     raise
@@ -172,12 +205,18 @@ class RosEnvironmentClient:
                 raise WireError(ErrorCode.BUSY, "sent again") from None
             return read(response)
 
+        repeated = RepeatedCall(client, request)
         try:
-            return retry_while_busy(attempt, self._timeout_s, check)
+            reply = retry_while_busy(attempt, self._timeout_s, check)
+            if client is self._reset:
+                repeated.await_rest()
+            return reply
         except WireError as error:
             if error.code == ErrorCode.BUSY:
                 raise PeerLost(f"busy for {self._timeout_s:g} s: {error}") from None
             raise
+        finally:
+            repeated.end()
 
     @property
     def _is_silent(self) -> bool:
@@ -235,140 +274,3 @@ def retry_while_busy(attempt: Callable[[float], Reply], timeout_s: float, check:
                 raise
         check()
         time.sleep(BUSY_WAIT_S)
-
-
-def call_in_executor(node: "ManagedNode", send: Callable[[], Future], timeout_s: float, check: Check) -> Any:
-    """Call `send` in the executor's thread and wait for the future it returns."""
-    deadline = time.monotonic() + timeout_s
-    future = send_in_executor(node, send, timeout_s, check)
-    return wait_for(future, max(0.0, deadline - time.monotonic()), check)
-
-
-def send_in_executor(node: "ManagedNode", send: Callable[[], Future], timeout_s: float, check: Check) -> Future:
-    """Call `send` in the executor's thread and return the future it returns.
-
-    rclpy's ActionClient notes a request only after sending it: sent from another thread, the answer may come before the
-    note and is then dropped ("Ignoring unexpected goal response").
-    """
-    sent: list[Future] = []
-    ready = threading.Event()
-
-    def run() -> None:
-        sent.append(send())
-        ready.set()
-
-    node.executor.create_task(run)
-    _wait(ready, timeout_s, check, f"this node's executor did not run for {timeout_s:g} s")
-    return sent[0]
-
-
-def goal_result(handle: Any, timeout_s: float, check: Check) -> Any:
-    """Wait in a worker thread for the result of an accepted goal; return the Result message.
-
-    A server that has just started may not have matched this client's reader yet, and then drops its answer for good
-    (rmw_fastrtps 556); the goal's status, which is kept for late readers, arrives. So the result is asked for again
-    where the goal has ended and its result is not here LOST_S later.
-
-    Raises:
-        PeerLost: not here after timeout_s, or the server does not know the goal (any more).
-    """
-    name, node = handle._action_client._action_name, handle._action_client._node
-    deadline = time.monotonic() + timeout_s
-    done = threading.Event()
-    asked: list[Future] = []
-
-    def ask() -> None:
-        asked.append(send_in_executor(node, handle.get_result_async, deadline - time.monotonic(), check))
-        asked[-1].add_done_callback(lambda _: done.set())
-
-    ask()
-    lost_at = time.monotonic() + LOST_S
-    while not done.wait(POLL_S):
-        check()
-        now = time.monotonic()
-        if now >= deadline:
-            raise PeerLost(f"{name}: no result within {timeout_s:g} s")
-        if handle.status not in ENDED:
-            lost_at = now + LOST_S
-        elif now >= lost_at:
-            node.get_logger().warning(f"{name}: the goal has ended and its result did not arrive; asked again")
-            ask()
-            lost_at = time.monotonic() + LOST_S
-    response = next(future for future in asked if future.done()).result()
-    node.executor.create_task(lambda: [future.cancel() for future in asked])
-    if response.status == GoalStatus.STATUS_UNKNOWN:
-        raise PeerLost(f"{name} does not know the goal it accepted; was its node restarted?")
-    return response.result
-
-
-def run_goal(
-    client: ActionClient, goal: Any, *, accept_s: float, check: Check, alive: Check, on_feedback: Any = None
-) -> Any:
-    """Send an action goal from a worker thread and wait for its result.
-
-    Args:
-        accept_s: deadline for the server to be there and to accept.
-        check: raises Cancelled when the caller must stop; the goal is then cancelled too, also one that was sent and is
-            accepted only later.
-        alive: raises PeerLost when the server is known to be gone.
-
-    Raises:
-        PeerLost: no server, no acceptance, a refusal for accept_s, or a lost server.
-    """
-    name, node = client._action_name, client._node
-    wait_until(client.server_is_ready, accept_s, check, name)
-    deadline = time.monotonic() + accept_s
-
-    def both() -> None:
-        check()
-        alive()
-
-    sent: list[Future] = []
-
-    def send() -> Future:
-        sent.append(client.send_goal_async(goal, feedback_callback=on_feedback))
-        return sent[-1]
-
-    while True:
-        try:
-            handle = call_in_executor(node, send, accept_s, both)
-        except BaseException as error:
-            node.executor.create_task(lambda: [future.add_done_callback(_cancel_accepted) for future in sent[-1:]])
-            if isinstance(error, PeerLost):
-                raise PeerLost(f"{name}: {error}") from None
-            raise
-        if handle.accepted:
-            try:
-                result = goal_result(handle, float("inf"), both)
-            except BaseException:
-                node.executor.create_task(handle.cancel_goal_async)
-                raise
-            if result.termination_reason != type(result).REFUSED:
-                return result
-        if time.monotonic() >= deadline:
-            reason = result.message if handle.accepted else "rejected"
-            raise PeerLost(f"{name} refused the goal for {accept_s:g} s: {reason}")
-        check()
-        time.sleep(POLL_S)
-
-
-def same_process(peers: PeerWatch, name: str) -> Callable[[], None]:
-    """Return a check that raises PeerLost once the peer is silent, stopped, or another process than it was here."""
-    asked = peers.identity(name)
-
-    def check() -> None:
-        nonlocal asked
-        asked = asked or peers.identity(name)
-        if peers.is_lost(name):
-            raise PeerLost(f"{name} is silent")
-        if peers.identity(name) != asked:
-            raise PeerLost(f"{name} was stopped or restarted")
-
-    return check
-
-
-def _cancel_accepted(sent: Future) -> None:
-    """Cancel a goal that was accepted after its sender had given up; in the executor's thread."""
-    handle = sent.result()
-    if handle is not None and handle.accepted:
-        handle.cancel_goal_async()

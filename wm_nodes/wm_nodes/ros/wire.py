@@ -3,7 +3,11 @@
 Shapes: N environments, A action, S state, P ground truth, H W 3 image. Stamps in ns.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from wm_nodes.core.errors import RunError
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array, UInt64Array
@@ -57,6 +61,11 @@ class ResetCommand:
     """Label of the episode events; empty: as before."""
     with_image: bool = True
     """Whether the answer carries the images."""
+
+    def equals(self, other: "ResetCommand") -> bool:
+        """Whether the two ask for the same."""
+        same_arrays = _same(self.mask, other.mask) and _same(self.seeds, other.seeds)
+        return same_arrays and replace(self, mask=None, seeds=None) == replace(other, mask=None, seeds=None)
 
 
 @dataclass(frozen=True)
@@ -129,3 +138,7 @@ class EpisodeNote:
     """That chose its first action."""
     policy_version_last: int
     """That chose its newest action."""
+
+
+def _same(array: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
+    return array is other if array is None or other is None else np.array_equal(array, other)

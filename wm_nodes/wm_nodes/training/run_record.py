@@ -8,8 +8,10 @@
       options:                    # by the command or launch file that was started in the folder
         train-policy: {reward: endogenous, model_dir: null, ...}
         online_training: {reward: endogenous, num_envs: '0', ...}
+      contents: {/models/mine: 9f2c..., ...}  # what lay at each path outside the folder, see training/contents.py
 
-Options and settings that are given again must be those of the record; what may differ takes effect and is kept.
+Options and settings that are given again must be those of the record; what may differ takes effect and is kept. So does
+another path to what a model's folder, a recording or a file held when the run first named it: it was moved or copied.
 """
 
 import hashlib
@@ -24,8 +26,9 @@ from wm_nodes.config.load import RECORD, Config, ConfigError, read_yaml
 from wm_nodes.config.sections import SettingsSection
 from wm_nodes.core.errors import first_few
 from wm_nodes.core.files import write_atomic
+from wm_nodes.training.contents import Contents, content_of, paths_in
 
-CONFIG, DEVICE, PRESET = "config.yaml", "device", "preset"
+CONFIG, CONTENTS, DEVICE, PRESET = "config.yaml", "contents", "device", "preset"
 HERE = "<run folder>/"
 """Stands in kept options for the folder that the record lies in, so that a run can be moved."""
 
@@ -67,6 +70,8 @@ class RunRecord:
     """Name or file that the settings were made from; empty: none."""
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Fixed and free options of each starter, by its name."""
+    contents: Contents = field(default_factory=Contents)
+    """Of the paths in settings and options; of a record without them they are kept from the next start on."""
 
     def with_device(self, device: str) -> "RunRecord":
         return replace(self, settings={**self.settings, DEVICE: device})
@@ -82,6 +87,8 @@ class RunRecord:
             PRESET: self.preset, "settings_sha256": _sha256(self.settings),
             "options": _renamed(self.options, f"{folder.absolute()}/", HERE),
         }
+        contents = self.contents.with_paths([self.settings, self.preset, self.options], folder.absolute())
+        run |= {CONTENTS: dict(contents.kept)} if contents.kept else {}
         data = str(yaml.safe_dump({**self.settings, RECORD: run}, sort_keys=False)).encode()
         path = folder / CONFIG
         if not path.is_file() or path.read_bytes() != data:
@@ -99,7 +106,7 @@ def read_record(folder: Path) -> RunRecord | None:
         return None
     settings = read_yaml(path)
     run = settings.pop(RECORD, None)
-    if not isinstance(run, dict) or {*run} != {PRESET, "settings_sha256", "options"}:
+    if not isinstance(run, dict) or {*run} - {CONTENTS} != {PRESET, "settings_sha256", "options"}:
         raise ConfigError(
             f"{path} does not say how the run was begun (section {RECORD}); restore it, or begin another run folder "
             "with this file as its preset"
@@ -109,7 +116,8 @@ def read_record(folder: Path) -> RunRecord | None:
             f"{path} is not what the run was begun with (settings_sha256 differs); restore it, or begin another run "
             "folder with this file as its preset"
         )
-    return RunRecord(settings, run[PRESET], _renamed(run["options"], HERE, f"{folder.absolute()}/"))
+    options = _renamed(run["options"], HERE, f"{folder.absolute()}/")
+    return RunRecord(settings, run[PRESET], options, Contents(run.get(CONTENTS, {})))
 
 
 def take_up(
@@ -124,7 +132,8 @@ def take_up(
         compare: False: of an existing run only the configuration is taken; options are those given, or defaults.
 
     Returns:
-        The configuration, all options, and the record to be written.
+        The configuration, all options, and the record to be written. Of what was moved they have the path that is
+        given.
 
     Raises:
         ConfigError: the run was begun with other options or settings, which are named, or by another command.
@@ -147,15 +156,25 @@ def take_up(
     if not compare:
         return config, options, record.with_options(starter, options)
     other = starter.load(saved, dict(settings), options) if settings else config
+    moved = record.contents.were_moved
     differences = {
         starter.called(name, option=True): (before[name], value)
-        for name, value in given.items() if name in starter.fixed and before[name] != value
+        for name, value in given.items()
+        if name in starter.fixed and before[name] != value and not moved(before[name], value)
     }
     run, now = dict(_leaves(config.model_dump())), dict(_leaves(other.model_dump()))
+    elsewhere = dict[str, Any]()
     for name in {**run, **now}:
         if run.get(name) != now.get(name) and name != DEVICE and any(_lies_in(name, part) for part in settings):
-            differences.setdefault(starter.called(name), (run.get(name), now.get(name)))
-    _refuse(folder, differences)
+            if moved(run.get(name), now.get(name)):
+                elsewhere[name] = now[name]
+            else:
+                differences.setdefault(starter.called(name), (run.get(name), now.get(name)))
+    _refuse(folder, differences, record.contents)
+    if elsewhere:
+        config = starter.load(saved, elsewhere, options)
+        record = replace(record, settings=config.model_dump())
+    record = replace(record, preset=options.get(PRESET, record.preset))
     if DEVICE in settings:
         config, record = config.with_values(device=other.device), record.with_device(other.device)
     return config, options, record.with_options(starter, options)
@@ -167,13 +186,27 @@ def keep_config(config: SettingsSection, folder: Path) -> None:
     (RunRecord(settings) if record is None else record.with_device(settings[DEVICE])).write(folder)
 
 
-def _refuse(folder: Path, differences: Mapping[str, tuple[Any, Any]]) -> None:
+def _refuse(folder: Path, differences: Mapping[str, tuple[Any, Any]], contents: Contents) -> None:
     if differences:
-        named = [f"{name} is {old!r} in this run, {new!r} is given" for name, (old, new) in differences.items()]
+        named = [
+            f"{name} is {old!r} in this run, {new!r} is given{_other_contents(old, new, contents)}"
+            for name, (old, new) in differences.items()
+        ]
         raise ConfigError(
             f"{folder} was begun with other options: {first_few(named)}. Leave them out to go on with it, or begin "
             "another run folder"
         )
+
+
+def _other_contents(old: Any, new: Any, contents: Contents) -> str:
+    """Why a path is not that of the same thing, moved."""
+    before, now = paths_in(old), paths_in(new)
+    if len(before) != len(now) or not all(map(content_of, now)):
+        return ""
+    unknown = [path for path in before if not contents.of(path)]
+    if unknown:
+        return f" (nobody knows what {unknown[0]} held: if it was moved, link it there and go on without this option)"
+    return " (which holds something else)" if before else ""
 
 
 def _renamed(value: Any, old: str, new: str) -> Any:

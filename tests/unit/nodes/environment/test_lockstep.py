@@ -1,6 +1,8 @@
 """Lock-step rules: the stamp of an observation; NaN of the model, an environment that raises, the emergency stop."""
 
+import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from graph.toy import ReachToy
 from wm_msgs.msg import EpisodeEvent, ErrorCode
 from wm_nodes.core.errors import WireError
 from wm_nodes.core.lockstep import Goals, LockStep
-from wm_nodes.core.types import FloatArray, StepResult, UInt8Array
+from wm_nodes.core.types import FloatArray, Observation, StepResult, UInt8Array
 from wm_nodes.nodes.environment.asynchronous import AsynchronousEnvironment
 from wm_nodes.nodes.environment.lockstep import LockstepEnvironment, StampClock
 from wm_nodes.ros.clients import LocalEnvironmentClient
@@ -194,3 +196,35 @@ def test_a_local_client_names_a_missing_environment_and_hides_no_fault_of_one() 
 
     with pytest.raises(AttributeError, match="a fault"):
         LocalEnvironmentClient(Faulty).reset(ResetCommand(), lambda: None)
+
+
+def test_a_reset_that_was_sent_again_while_it_was_made_is_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    made, reset = list[int](), bench.environment.reset
+
+    def slow(*arguments: Any) -> Observation:
+        made.append(len(made))
+        time.sleep(0.2)
+        return reset(*arguments)
+
+    monkeypatch.setattr(bench.environment, "reset", slow)
+    command = ResetCommand(np.ones(N, bool), np.full(N, 5, np.uint64), behaviour="policy")
+    again = ResetCommand(np.ones(N, bool), np.full(N, 5, np.uint64), behaviour="policy")
+    assert bench.served.reset(command) is bench.served.reset(again)
+    assert len(made) == 1 and len(bench.transitions) == 2
+    for other in (
+        replace(command, seeds=np.full(N, 6, np.uint64)), replace(command, mask=np.array([True, False])),
+        replace(command, behaviour="evaluation"), replace(command, seeds=None), replace(command, seeds=None),
+    ):
+        count = len(made)
+        bench.served.reset(other)
+        assert len(made) == count + 1
+    for between in (
+        lambda: bench.served.step(bench.command()), lambda: time.sleep(0.3),
+        lambda: bench.served.end_episodes(EpisodeEvent.REASON_ESTOP),
+    ):
+        bench.served.reset(command)
+        count = len(made)
+        between()
+        bench.served.reset(again)
+        assert len(made) == count + 1

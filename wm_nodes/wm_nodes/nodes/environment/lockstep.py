@@ -26,6 +26,9 @@ from wm_nodes.ros.wire import EpisodeNote, Reply, ResetCommand, StepCommand
 
 UNIT_TOLERANCE = 1e-6
 
+REPEAT_S = 1.0
+"""A reset that was sent again while the first one was made waits for its end, and is taken at most so long after it."""
+
 
 class StampClock:
     """Gives the stamps of one node's observations: wall time, and always later than the stamp before.
@@ -71,6 +74,28 @@ class _Plan:
     """Of that observation."""
 
 
+@dataclass(frozen=True)
+class _Reset:
+    """A reset that was made, and that its sender may have asked for again meanwhile."""
+
+    command: ResetCommand
+    """What was asked for; it names its seeds."""
+    reply: Reply
+    """What was answered."""
+    began_s: float
+    """When it began, on the time.monotonic clock."""
+    ended_s: float
+    """When it was answered, on that clock."""
+
+    def answers(self, command: ResetCommand) -> bool:
+        """Whether a request is this one, sent again: equal, and taken sooner after the answer than that took to make.
+
+        One that names no seeds is a new one: it asks for other seeds.
+        """
+        soon_s = min(self.ended_s - self.began_s, REPEAT_S)
+        return command.equals(self.command) and time.monotonic() - self.ended_s < soon_s
+
+
 class LockstepEnvironment:
     """Serves one Environment to one client at a time. Thread-safe.
 
@@ -98,6 +123,7 @@ class LockstepEnvironment:
         self._stamp_ns = 0
         self._last_step_id = 0
         self._last_reply: Reply | WireError | None = None
+        self._last_reset: _Reset | None = None
         self._current: Observation | None = None
         self._episodes = RunningEpisodes(self.spec.num_envs, self.spec.max_episode_steps, sink.episode)
 
@@ -106,12 +132,16 @@ class LockstepEnvironment:
         return self._last_step_id + 1
 
     def reset(self, command: ResetCommand) -> Reply:
-        """Reset the masked environments. Publishes the new frame and one transition without action.
+        """Reset the masked environments. Publishes the new frame and one transition without action; the same reset that
+        was sent again while it was made returns the stored answer.
 
         Raises:
             WireError: NOT_FOUND for another task, ESTOP, INTERNAL, or what before_step refuses.
         """
         with self._lock:
+            if self._last_reset is not None and self._last_reset.answers(command):
+                return self._last_reset.reply
+            self._last_reset, began_s = None, time.monotonic()
             if command.task and command.task != self.spec.task:
                 raise WireError(
                     ErrorCode.NOT_FOUND,
@@ -132,6 +162,8 @@ class LockstepEnvironment:
             self._publish_observation(goals_changed=True)
             self._episodes.start(mask, self._current.episode_id, seeds, self._stamp_ns)
             self._sink.transition(self._reset_lockstep())
+            if command.seeds is not None:
+                self._last_reset = _Reset(command, reply, began_s, time.monotonic())
             return reply
 
     def step(self, command: StepCommand) -> Reply:
@@ -146,6 +178,7 @@ class LockstepEnvironment:
             self._check_client(command)
             if self._last_reply is None or command.step_id != self._last_step_id:
                 plan, started = self._plan(command), time.perf_counter()
+                self._last_reset = None
                 result = self._advance(plan)
                 valid, broken = self._judge_ends(plan, result)
                 self._reset_some(plan, result.observation)
@@ -181,6 +214,7 @@ class LockstepEnvironment:
     def end_episodes(self, reason: int) -> None:
         """End all running episodes, e.g. when the node stops or the estop is set."""
         with self._lock:
+            self._last_reset = None
             self._episodes.end(np.ones(self.spec.num_envs, bool), reason, self._stamp_ns, abort=True)
 
     def close(self) -> None:

@@ -67,6 +67,11 @@ class RolloutAssembler:
         return self._collecting
 
     @property
+    def num_collected(self) -> int:
+        """Lock-steps of the unfinished rollout that have come; resets are none."""
+        return len(self._current.steps)
+
+    @property
     def waiting(self) -> int:
         """Replayed rollouts that have ended and were not taken yet."""
         return len(self._ended)

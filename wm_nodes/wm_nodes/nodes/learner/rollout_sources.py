@@ -21,7 +21,8 @@ from wm_nodes.nodes.learner.rollout_assembler import RolloutAssembler
 from wm_nodes.policy_rl.rollouts import TensorRollout
 from wm_nodes.policy_rl.training_run import Progress
 from wm_nodes.recording import BagReport, read_rollouts, topics
-from wm_nodes.ros.clients import Check, run_goal, same_process
+from wm_nodes.ros.clients import Check
+from wm_nodes.ros.goals import run_goal, same_process
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.wire import PeerLost
 from wm_nodes.ros.worker import Work
@@ -54,6 +55,10 @@ class RolloutSource(Protocol):
     def close(self) -> None: ...
 
 
+class _IncompleteRollout(PeerLost):
+    """Images or rewards of a rollout that was made did not arrive."""
+
+
 class LiveRollouts:
     """Asks the policy node for rollouts and joins what the graph publishes about them. check: as ReplayedRollouts's."""
 
@@ -67,24 +72,35 @@ class LiveRollouts:
         self.left_out: list[str] = []
 
     def next(self) -> tuple[Rollout, DroppedTransitions] | None:
-        """A lost node may come back within recovery_timeout_s: the same seed gives the same rollout again."""
-        node = self._node
-        give_up = time.monotonic() + float(node.param("recovery_timeout_s"))
-        gaps, began = 0, time.monotonic()
+        """The rollout of the version that is trained now, repeated until it is made: the same seed gives it again.
+
+        A lost node may take recovery_timeout_s to come back, from the first loss on; a rollout that was made ends the
+        wait, and so does an attempt in which steps were made and that took longer. One of which something did not
+        arrive is made MAX_GAP_RETRIES times more, and then once more and taken with its gaps.
+        """
+        node, began_s = self._node, time.monotonic()
+        recovery_s = float(node.param("recovery_timeout_s"))
+        gaps = repeats = 0
+        lost_s: float | None = None
         while True:
+            attempt_s = time.monotonic()
             try:
                 rollout = self._attempt(accept_gaps=gaps > MAX_GAP_RETRIES)
-                if gaps:
-                    node.get_logger().info(f"the rollout is complete after {time.monotonic() - began:.1f} s")
+                if repeats:
+                    node.get_logger().info(f"the rollout is complete after {time.monotonic() - began_s:.1f} s")
                 return rollout
+            except _IncompleteRollout as error:
+                gaps, lost_s, text = gaps + 1, None, str(error)
             except PeerLost as error:
-                text = str(error)
-                node.diagnostics.count("repeated_rollouts", text=f"rollout repeated: {text}")
-                if not gaps:
-                    node.get_logger().warning(f"rollout repeated until it is complete: {text}")
-                gaps += 1
-                if time.monotonic() > give_up:
-                    raise PeerLost(f"{text}; nothing came back for {node.param('recovery_timeout_s'):g} s") from None
+                now_s, text = time.monotonic(), str(error)
+                worked = self._assembler.num_collected > 0 and now_s - attempt_s > recovery_s
+                lost_s = now_s if lost_s is None or worked else lost_s
+                if now_s - lost_s > recovery_s:
+                    raise PeerLost(f"{text}; nothing came back for {recovery_s:g} s") from None
+            node.diagnostics.count("repeated_rollouts", text=f"rollout repeated: {text}")
+            if not repeats:
+                node.get_logger().warning(f"rollout repeated until it is complete: {text}")
+            repeats += 1
             self._work.sleep(RETRY_S)
 
     def close(self) -> None:
@@ -117,7 +133,9 @@ class LiveRollouts:
                 node.diagnostics.count("incomplete_steps", len(missing), text=f"{len(missing)} lock-steps incomplete")
                 if accept_gaps:
                     break
-                raise PeerLost(f"images or rewards of {len(missing)} lock-steps did not arrive; is every node active?")
+                raise _IncompleteRollout(
+                    f"images or rewards of {len(missing)} lock-steps did not arrive; is every node active?"
+                )
             self._assembler.wait(0.1)
         return self._assembler.take(result.first_step_id, result.last_step_id, version)
 
