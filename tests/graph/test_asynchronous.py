@@ -129,7 +129,7 @@ def test_no_action_is_published_or_executed_after_an_emergency_stop_until_it_is_
         "toy:make_long_environment", num_envs=N, mode="asynchronous", control_period_s=PERIOD_S, max_action_age_s=5.0
     )
     policy = graph.start("policy", policy__factory="toy:make_slow_policy", mode="asynchronous")
-    wait_until("both nodes", lambda: estop.get_subscription_count() >= 2)
+    wait_until("both readers of both nodes", lambda: estop.get_subscription_count() >= 4)
     for _ in range(3):
         seen = len(actions)
         wait_until("actions", lambda: len(actions) > seen + 2 and not held(transitions[-1]))  # noqa: B023
@@ -177,7 +177,7 @@ def test_a_rollout_ends_with_the_emergency_stop_as_its_reason(graph: Graph, prob
     transitions, estop = probe.listen("env/transition"), probe.publisher("safety/estop")
     graph.start_environment("toy:make_long_environment", num_envs=N)
     graph.start_policy()
-    wait_until("both nodes", lambda: estop.get_subscription_count() >= 2)
+    wait_until("both readers of both nodes", lambda: estop.get_subscription_count() >= 4)
     handle = probe.send(probe.action(Rollout, "rollout"), Rollout.Goal(steps=100_000, reset=True))
     wait_until("steps", lambda: len(transitions) > 5)
     estop.publish(Bool(data=True))

@@ -102,7 +102,7 @@ class EnvironmentNode(ManagedNode):
         self._goals = self.publish_on("env/goal")
         self._credits = ProducerCredits("env/transition", self.session)
         self.listen("flow/credit", self._credits.note)
-        self.listen("safety/estop", self._on_estop, while_inactive=True)
+        self.listen_estop(self._on_estop)
         self.serve(StepBatch, "env/step", self._on_step)
         self.serve(ResetBatch, "env/reset", self._on_reset)
         self.serve(GetEnvSpec, "env/get_spec", self._on_get_spec)

@@ -92,7 +92,7 @@ class PolicyNode(ManagedNode):
                 self, self._holder, self._publish_actions, self._publish_hold, stopped=self._estop
             )
         self._actions = self.publish_on("action", LIVE_ACTION if self._asynchronous else None)
-        self.listen("safety/estop", self._on_estop, while_inactive=True)
+        self.listen_estop(self._on_estop)
         self.listen("env/spec", self._on_spec, while_inactive=True)
         self.listen("policy/version", self._on_version, while_inactive=True)
         self.serve(InferAction, "policy/infer", self._on_infer, counted="refused_infer", code=ErrorCode.BAD_SHAPE)

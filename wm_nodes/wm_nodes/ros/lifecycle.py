@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -28,7 +29,7 @@ from wm_nodes.ros.guard import Guard
 from wm_nodes.ros.liveliness import HEARTBEAT_S, Heartbeat, PeerWatch
 from wm_nodes.ros.params import COMMON, Param, declare, refusal
 from wm_nodes.ros.publishing import StampedPublisher
-from wm_nodes.ros.qos import topic
+from wm_nodes.ros.qos import ANY_PUBLISHER, topic
 from wm_nodes.ros.sequence_numbers import GapTracker, new_session
 
 T = TypeVar("T")
@@ -201,6 +202,15 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         if credits is not None:
             self.own(credits.close)
         return credits
+
+    def listen_estop(self, callback: Callable[[Any], None]) -> None:
+        """Hear safety/estop until cleanup, active or not: what was latched before, and publishers of any QoS, which a
+        latched reader does not match. The callback may get a message twice; received and dropped are counted under the
+        topic's relative and its absolute name."""
+        row, quiet = topic("safety/estop"), SubscriptionEventCallbacks(use_default_callbacks=False)
+        for name, qos in ((row.name, row.reader_qos), (self.resolve_topic_name(row.name), ANY_PUBLISHER)):
+            subscription = self.create_subscription(row.type, name, callback, qos, event_callbacks=quiet)
+            self.own(self.destroy_subscription, subscription)
 
     def serve(
         self, service_type: type[Any], name: str, callback: Callable[[Any, Any], Any], *, counted: str = "",
