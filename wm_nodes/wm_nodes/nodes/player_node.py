@@ -3,6 +3,7 @@
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -231,9 +232,10 @@ class PlayerNode(ManagedNode):
         try:
             self._play(playback, request, None)
             self.get_logger().info(f"played {playback.messages} messages")
-        except BagError as error:
-            self.get_logger().error(f"playing failed: {error}")
-            self.diagnostics.set_condition("playing", diagnostics.ERROR, str(error))
+        except Exception as error:
+            trace = "" if isinstance(error, BagError) else f"\n{traceback.format_exc()}"
+            self.get_logger().error(f"playing failed: {error}{trace}".rstrip())
+            self.diagnostics.set_condition("playing", diagnostics.ERROR, str(error) or type(error).__name__)
 
     def _replay(self, work: Work, result: Replay.Result) -> None:
         began = time.monotonic()
