@@ -133,9 +133,9 @@ class EnvironmentNode(ManagedNode):
             self.served.end_episodes(EpisodeEvent.REASON_DEACTIVATED)
 
     def cleanup(self) -> None:
-        if self.served is not None:
-            self.served.close()
-            self.served = None
+        served, self.served = self.served, None
+        if served is not None:
+            served.close()
 
     def on_peer_lost(self, name: str) -> None:
         if self.served is not None:

@@ -46,7 +46,8 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     configure() builds objects, publishers, subscriptions and services; cleanup() lets go of what configure() made
     (entities made through publish_on, listen, serve are destroyed here). The four raise on failure: one of REFUSALS
-    leaves the state as it was with one error line; anything else goes through error processing to `unconfigured`.
+    leaves the state as it was with one error line, but never holds up cleanup(); anything else goes through error
+    processing to `unconfigured`. cleanup() also follows a configure() that failed half-way.
     """
 
     def __init__(self, name: str, params: Sequence[Param] = (), **node_arguments: Any) -> None:
@@ -280,7 +281,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self.session = new_session()
         result = self._attempt("configure", self.configure)
         if result == TransitionCallbackReturn.FAILURE:
-            self._release()
+            self._let_go()
         return result
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -301,9 +302,9 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         return result
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        result = self._attempt("cleanup", self.cleanup)
+        result, done = self._attempt("cleanup", self.cleanup), TransitionCallbackReturn.SUCCESS
         self._release()
-        return result
+        return done if result == TransitionCallbackReturn.FAILURE else result  # nothing is left to clean up
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         if self._active:
@@ -336,6 +337,14 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self.get_logger().error(f"{action} failed: {text or type(error).__name__}")
         self.diagnostics.set_condition("lifecycle", diagnostics.ERROR, f"{action} failed: {text}")
         return result
+
+    def _let_go(self) -> None:
+        """Clean up after a configure() that failed, whose reason stays in diagnostics; a further error is logged."""
+        try:
+            self.cleanup()
+        except Exception:
+            self.get_logger().error(f"cleanup failed: {traceback.format_exc()}")
+        self._release()
 
     def _release(self) -> None:
         self._introspected.clear()
