@@ -1,4 +1,4 @@
-"""Lifecycle transitions that fail, of real nodes in this process."""
+"""Lifecycle transitions that fail, and what else real nodes answer without a graph; in this process."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,7 +15,10 @@ from wm_msgs.action import Replay
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.nodes import environment_node
 from wm_nodes.nodes.environment_node import EnvironmentNode
+from wm_nodes.nodes.evaluation_node import EvaluationNode
 from wm_nodes.nodes.player_node import PlayerNode
+from wm_nodes.nodes.policy_node import PolicyNode
+from wm_nodes.nodes.reward_evaluator_node import RewardEvaluatorNode
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.qos import topic
 
@@ -45,14 +48,15 @@ class Robot(TwoCameras):
 
 @pytest.fixture
 def make_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    nodes = list[ManagedNode]()
+    nodes = list[EnvironmentNode]()
 
     def make(robot: Robot) -> EnvironmentNode:
         monkeypatch.setattr(environment_node, "make_environment", lambda *_, **__: robot)
         (tmp_path / "config.yaml").write_text(dump_config(load_config("smoke")), encoding="utf-8")
-        values = {"config_file": str(tmp_path / "config.yaml"), "backend": "environment"}
-        nodes.append(EnvironmentNode(parameter_overrides=[Parameter(name, value=each) for name, each in values.items()]))
-        return nodes[-1]  # type: ignore[return-value]
+        nodes.append(EnvironmentNode(parameter_overrides=[
+            Parameter("config_file", value=str(tmp_path / "config.yaml")), Parameter("backend", value="environment")
+        ]))
+        return nodes[-1]
 
     yield make
     for node in nodes:
@@ -97,6 +101,17 @@ def test_a_node_whose_robot_cannot_be_closed_is_unconfigured_and_can_be_configur
     assert (state(node), robot.closed) == ("unconfigured", 1)
     assert node.trigger_configure() == DONE and state(node) == "inactive"
     assert node.count_subscribers(topic("safety/estop").name) == 2
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [(PolicyNode, "step_timeout_s"), (EvaluationNode, "step_timeout_s"), (RewardEvaluatorNode, "summary_period_s")],
+)
+def test_a_parameter_that_only_configure_reads_cannot_be_set_while_the_node_runs(make: Any, name: str) -> None:
+    node = make()
+    refused = node.set_parameters_atomically([Parameter(name, value=2.5)])
+    assert not refused.successful and f"start it again with {name}:=2.5" in refused.reason
+    node.destroy_node()
 
 
 def test_a_bag_that_cannot_be_played_on_for_whatever_reason_is_an_error_of_the_player(

@@ -41,7 +41,7 @@ HOLD_ARRIVES = Duration(seconds=1)
 PARAMS = (
     Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
     Param("initial_policy", "", "Weights (safetensors) to act with before the learner announces any", read_only=True),
-    Param("step_timeout_s", 10.0, "Deadline of one env/step or env/reset, retries included", "s",
+    Param("step_timeout_s", 10.0, "Deadline of one env/step or env/reset, retries included", "s", read_only=True,
           minimum=0.1, maximum=600.0),
     Param("handshake_timeout_s", 10.0, "Deadline for the environment to answer env/get_spec", "s",
           minimum=0.1, maximum=600.0),
