@@ -249,11 +249,15 @@ class PlayerNode(ManagedNode):
         """Hold a transition back until every consumer has granted it, as the environment does."""
         session, seq = session_and_seq(data)
         credits = self._credits.setdefault(session, ProducerCredits(CREDITED, session))
-        while credits.blocking_consumers(seq):
-            for name in credits.drop_silent(seq):
-                self.diagnostics.count("silent_consumers", text=f"{name} granted nothing for 5 s and is not waited for")
-            check()
-            time.sleep(0.002)
+        if not credits.blocking_consumers(seq):
+            return
+        with playback.held_back():
+            while credits.blocking_consumers(seq):
+                for name in credits.drop_silent(seq):
+                    text = f"{name} granted nothing for 5 s and is not waited for"
+                    self.diagnostics.count("silent_consumers", text=text)
+                check()
+                time.sleep(0.002)
 
     def _on_credit(self, message: Credit) -> None:
         credits = self._credits.get(message.stream_session)
