@@ -9,11 +9,13 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import toy
 from graph.harness import Graph, Probe, wait_until
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from sensor_msgs.msg import Image
 from std_msgs.msg import Bool
 
 from wm_msgs.action import Rollout
-from wm_msgs.msg import ActionBatch, ErrorCode
+from wm_msgs.msg import ActionBatch, Credit, EpisodeEvent, ErrorCode
 from wm_msgs.srv import StepBatch
 from wm_nodes.recording.messages import time_ns
 from wm_nodes.ros import calls, convert
@@ -129,7 +131,7 @@ def test_no_action_is_published_or_executed_after_an_emergency_stop_until_it_is_
         "toy:make_long_environment", num_envs=N, mode="asynchronous", control_period_s=PERIOD_S, max_action_age_s=5.0
     )
     policy = graph.start("policy", policy__factory="toy:make_slow_policy", mode="asynchronous")
-    wait_until("both nodes", lambda: estop.get_subscription_count() >= 2)
+    wait_until("both readers of both nodes", lambda: estop.get_subscription_count() >= 4)
     for _ in range(3):
         seen = len(actions)
         wait_until("actions", lambda: len(actions) > seen + 2 and not held(transitions[-1]))  # noqa: B023
@@ -173,11 +175,46 @@ def test_no_action_is_published_or_executed_after_an_emergency_stop_until_it_is_
     wait_until("actions of the new policy", lambda: len(actions) > count + 3)
 
 
+def test_a_robot_holds_while_nobody_takes_its_steps_and_when_its_node_is_deactivated(
+    graph: Graph, probe: Probe
+) -> None:
+    transitions, events = probe.listen("env/transition"), probe.listen("episode")
+    actions, credit = probe.publisher("action"), probe.publisher("flow/credit")
+    graph.start_environment(
+        "toy:make_robot", num_envs=N, mode="asynchronous", control_period_s=0.05, max_action_age_s=60.0
+    )
+    wait_until("the environment", lambda: transitions and actions.get_subscription_count())
+    wait_until("matching", credit.get_subscription_count)
+    message = ActionBatch(num_envs=N, action_dim=3, chunk_length=1)
+    message.action = convert.to_field(np.full(3 * N, 0.25, np.float32))
+    actions.publish(message)  # of a person: it ages from its arrival
+
+    def told() -> list[str]:
+        return [line for line in graph.log("/wm/environment").splitlines() if line.startswith("told")]
+
+    def grant(seq: int) -> None:
+        session = transitions[-1].session
+        credit.publish(Credit(consumer="/wm/idle", topic="env/transition", stream_session=session, granted_seq=seq))
+
+    wait_until("motion", lambda: "told 0.25" in told())
+    grant(0)
+    wait_until("the count", lambda: value(probe, "steps_left_out") > 1)
+    assert told()[-2:] == ["told 0.25", "told 0"], "it holds once"
+    assert "a robot holds: waiting for /wm/idle" in probe.diagnostics["/wm/environment"].message
+    assert probe.diagnostics["/wm/environment"].level == DiagnosticStatus.WARN
+    grant(2**40)
+    wait_until("motion again", lambda: told()[-1] == "told 0.25")
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+    assert probe.call(ChangeState, "environment/change_state", request).success
+    assert told()[-2:] == ["told 0.25", "told 0"]
+    wait_until("ends", lambda: sum(e.termination_reason == EpisodeEvent.REASON_DEACTIVATED for e in events) == N)
+
+
 def test_a_rollout_ends_with_the_emergency_stop_as_its_reason(graph: Graph, probe: Probe) -> None:
     transitions, estop = probe.listen("env/transition"), probe.publisher("safety/estop")
     graph.start_environment("toy:make_long_environment", num_envs=N)
     graph.start_policy()
-    wait_until("both nodes", lambda: estop.get_subscription_count() >= 2)
+    wait_until("both readers of both nodes", lambda: estop.get_subscription_count() >= 4)
     handle = probe.send(probe.action(Rollout, "rollout"), Rollout.Goal(steps=100_000, reset=True))
     wait_until("steps", lambda: len(transitions) > 5)
     estop.publish(Bool(data=True))

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from graph.harness import Graph, Probe, wait_until
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 
 from wm_msgs.msg import EpisodeEvent, ErrorCode
@@ -118,6 +119,40 @@ def test_estop_ends_the_episodes_and_refuses_steps_until_it_is_released(client: 
     start = client.reset()
     estop.publish(Bool(data=True))
     wait_until("ended episodes", lambda: sum(e.termination_reason == EpisodeEvent.REASON_ESTOP for e in events) == N)
+    with pytest.raises(WireError, match="emergency stop"):
+        client.step(client.command(start.step_id + 1))
+    estop.publish(Bool(data=False))
+    wait_until("release", lambda: _stepped(client, start.step_id + 1))
+
+
+def test_a_robot_is_told_to_hold_by_an_emergency_stop_between_two_requests(graph: Graph, probe: Probe) -> None:
+    estop = probe.publisher("safety/estop")
+    graph.start_environment("toy:make_robot", num_envs=N)
+    client = Client(probe)
+    wait_until("matching", estop.get_subscription_count)
+    start = client.reset()
+    client.step(client.command(start.step_id + 1, np.full((N, 3), 0.5)))
+    estop.publish(Bool(data=True))
+    wait_until("the hold", lambda: "\ntold 0\n" in graph.log("/wm/environment"))
+    with pytest.raises(WireError, match="emergency stop"):
+        client.step(client.command(start.step_id + 2))
+    assert graph.log("/wm/environment").count("told 0\n") == 1
+
+
+@pytest.mark.parametrize("reliability", [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT])
+def test_an_emergency_stop_is_heard_from_a_publisher_that_latches_nothing(
+    graph: Graph, probe: Probe, reliability: ReliabilityPolicy
+) -> None:
+    estop = probe.node.create_publisher(Bool, "safety/estop", QoSProfile(depth=10, reliability=reliability))
+    graph.start_environment(num_envs=N)
+    graph.start_policy()
+    client, nodes = Client(probe), ("/wm/environment", "/wm/policy")
+    start = client.reset()
+    wait_until("both nodes", lambda: all(node in probe.diagnostics for node in nodes))
+    wait_until("matching", lambda: estop.get_subscription_count() >= len(nodes))
+    estop.publish(Bool(data=True))
+    for node in nodes:
+        wait_until("the condition", lambda: "emergency stop is set" in probe.diagnostics[node].message)  # noqa: B023
     with pytest.raises(WireError, match="emergency stop"):
         client.step(client.command(start.step_id + 1))
     estop.publish(Bool(data=False))

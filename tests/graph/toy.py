@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import PolicyConfig, RunConfig
 from wm_nodes.core.cameras import CameraModel, Matrix, intrinsics, look_at
-from wm_nodes.core.specs import SOURCE_SIMULATOR, EnvironmentSpec
+from wm_nodes.core.specs import SOURCE_REAL, SOURCE_SIMULATOR, EnvironmentSpec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
@@ -99,6 +99,25 @@ def make_environment(config: RunConfig, num_envs: int, seed: int) -> ReachToy:
 def make_long_environment(config: RunConfig, num_envs: int, seed: int) -> ReachToy:
     """Episodes that outlast every test."""
     return ReachToy(num_envs, seed, max_episode_steps=100_000)
+
+
+class Robot(ReachToy):
+    """Says that it is a robot, and what it is told to do: `told VALUE` in the log."""
+
+    def __init__(self, num_envs: int, seed: int) -> None:
+        super().__init__(num_envs, seed, max_episode_steps=100_000)
+        self.spec = replace(self.spec, source=SOURCE_REAL)
+
+    def step(self, actions: FloatArray) -> StepResult:
+        print(f"told {actions.flat[0]:g}", flush=True)
+        return super().step(actions)
+
+    def close(self) -> None:
+        print("told nothing more", flush=True)
+
+
+def make_robot(config: RunConfig, num_envs: int, seed: int) -> Robot:
+    return Robot(num_envs, seed)
 
 
 def make_environment_of_large_images(config: RunConfig, num_envs: int, seed: int) -> ReachToy:

@@ -84,6 +84,30 @@ def test_a_long_wait_is_said_once_and_ends_by_a_seek(tmp_path: Path) -> None:
     assert said == ["the next message is at 600.000 s of the bag, due in 300 s; seek to go on now"]
 
 
+def test_single_messages_are_answered_as_soon_as_one_is_held_back_which_is_counted_once(tmp_path: Path) -> None:
+    playback = Playback(chatter(tmp_path / "bag", [NOW_NS + number for number in range(10)]), paused=True)
+    published, granted = list[bytes](), threading.Semaphore(3)
+
+    def publish(name: str, data: bytes) -> None:
+        if not granted.acquire(blocking=False):
+            with playback.held_back():
+                granted.acquire()
+        published.append(data)
+
+    thread = threading.Thread(target=playback.run, args=(publish, lambda time_ns: None))
+    thread.start()
+    began = time.monotonic()
+    assert [playback.play_next(8), playback.play_next(8)] == [4, 0]
+    assert time.monotonic() - began < within(1)
+    granted.release(100)
+    while len(published) < 4:
+        time.sleep(0.01)
+    assert playback.play_next(4) == 4
+    playback.stop()
+    thread.join()
+    assert published == [text(number) for number in range(8)]
+
+
 def test_a_recording_whose_clock_was_set_back_is_played_in_the_order_it_was_made(tmp_path: Path) -> None:
     spec = make_spec()
     with EpisodeBagWriter(tmp_path / "own", spec, run_id="test", start_ns=NOW_NS) as episodes:

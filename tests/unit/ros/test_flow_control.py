@@ -1,5 +1,8 @@
 """Sequence numbers, credit, peers and the assembler, without DDS."""
 
+import sys
+import threading
+
 import numpy as np
 import pytest
 
@@ -75,6 +78,35 @@ def test_the_producer_waits_for_every_consumer_and_drops_the_silent_one() -> Non
     assert ledger.drop_silent(11, now=100.0 + SILENT_S) == []
     assert ledger.drop_silent(11, now=100.1 + SILENT_S) == ["slow"]
     assert ledger.blocking_consumers(20) == []
+
+
+def test_a_worker_may_ask_who_blocks_while_the_executor_takes_in_credits() -> None:
+    ledger, ended, failed = ProducerCredits("env/transition", session=7), threading.Event(), list[Exception]()
+    for number in range(60):
+        ledger.note(Credit(consumer=f"{number}", topic="env/transition", stream_session=7))
+
+    def ask() -> None:
+        try:
+            while not ended.is_set():
+                ledger.blocking_consumers(1)
+                ledger.drop_silent(1, now=0.0)
+                assert ledger.consumers
+        except Exception as error:
+            failed.append(error)
+
+    interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    worker = threading.Thread(target=ask)
+    worker.start()
+    try:
+        for number in range(20_000):
+            ledger.note(Credit(consumer=f"{number % 70}", topic="env/transition", stream_session=7))
+            ledger.remove(f"{number * 7 % 70}")
+    finally:
+        ended.set()
+        worker.join()
+        sys.setswitchinterval(interval_s)
+    assert not failed
 
 
 class GrantingNode:

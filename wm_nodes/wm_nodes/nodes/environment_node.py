@@ -102,7 +102,7 @@ class EnvironmentNode(ManagedNode):
         self._goals = self.publish_on("env/goal")
         self._credits = ProducerCredits("env/transition", self.session)
         self.listen("flow/credit", self._credits.note)
-        self.listen("safety/estop", self._on_estop, while_inactive=True)
+        self.listen_estop(self._on_estop)
         self.serve(StepBatch, "env/step", self._on_step)
         self.serve(ResetBatch, "env/reset", self._on_reset)
         self.serve(GetEnvSpec, "env/get_spec", self._on_get_spec)
@@ -129,12 +129,13 @@ class EnvironmentNode(ManagedNode):
             self._timer = None
         self._send_rest()
         if self.served is not None:
+            self._hold()
             self.served.end_episodes(EpisodeEvent.REASON_DEACTIVATED)
 
     def cleanup(self) -> None:
-        if self.served is not None:
-            self.served.close()
-            self.served = None
+        served, self.served = self.served, None
+        if served is not None:
+            served.close()
 
     def on_peer_lost(self, name: str) -> None:
         if self.served is not None:
@@ -238,7 +239,9 @@ class EnvironmentNode(ManagedNode):
             if not self._asynchronous.tick():
                 self.diagnostics.count("action_timeouts", text="no fresh action; the environment holds")
         except WireError as error:
-            if error.code != ErrorCode.ESTOP:
+            if error.code == ErrorCode.BUSY:
+                self.diagnostics.count("steps_left_out", text=f"a step was left out, and a robot holds: {error}")
+            elif error.code != ErrorCode.ESTOP:
                 self._count_refusal(error, "step")
             return
         spent = time.perf_counter() - began
@@ -254,12 +257,20 @@ class EnvironmentNode(ManagedNode):
         self.get_logger().warning(f"emergency stop {'set' if message.data else 'released'}")
         if not message.data:
             return
-        try:
-            if self._asynchronous is not None and self.active:
-                self._asynchronous.stop()
-        except WireError as error:
-            self._count_refusal(error, "step")
+        if self.active:
+            self._hold()
         self.served.end_episodes(EpisodeEvent.REASON_ESTOP)
+
+    def _hold(self) -> None:
+        """Have a robot hold, as no further step may come; a simulator, too, where it has a clock of its own."""
+        assert self.served is not None
+        try:
+            if self._asynchronous is not None:
+                self._asynchronous.stop()
+            elif self.served.is_robot:
+                self.served.hold_now()
+        except WireError as error:
+            self._count_refusal(error, "hold")
 
     def _ready(self) -> LockstepEnvironment:
         self.require_active()

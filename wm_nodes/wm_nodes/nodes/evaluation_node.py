@@ -23,7 +23,8 @@ PARAMS = (
     Param("initial_policy", "", "Weights (safetensors) for goals without version and file, before any announcement",
           read_only=True),
     Param("env_namespace", "sim", "Relative namespace of the environment node to evaluate in", read_only=True),
-    Param("step_timeout_s", 20.0, "Deadline of one env/step or env/reset", "s", minimum=0.1, maximum=600.0),
+    Param("step_timeout_s", 20.0, "Deadline of one env/step or env/reset", "s", read_only=True,
+          minimum=0.1, maximum=600.0),
     Param("handshake_timeout_s", 20.0, "Deadline for the environment to answer env/get_spec", "s",
           minimum=0.1, maximum=600.0),
 )

@@ -3,6 +3,7 @@
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -231,9 +232,10 @@ class PlayerNode(ManagedNode):
         try:
             self._play(playback, request, None)
             self.get_logger().info(f"played {playback.messages} messages")
-        except BagError as error:
-            self.get_logger().error(f"playing failed: {error}")
-            self.diagnostics.set_condition("playing", diagnostics.ERROR, str(error))
+        except Exception as error:
+            trace = "" if isinstance(error, BagError) else f"\n{traceback.format_exc()}"
+            self.get_logger().error(f"playing failed: {error}{trace}".rstrip())
+            self.diagnostics.set_condition("playing", diagnostics.ERROR, str(error) or type(error).__name__)
 
     def _replay(self, work: Work, result: Replay.Result) -> None:
         began = time.monotonic()
@@ -247,11 +249,15 @@ class PlayerNode(ManagedNode):
         """Hold a transition back until every consumer has granted it, as the environment does."""
         session, seq = session_and_seq(data)
         credits = self._credits.setdefault(session, ProducerCredits(CREDITED, session))
-        while credits.blocking_consumers(seq):
-            for name in credits.drop_silent(seq):
-                self.diagnostics.count("silent_consumers", text=f"{name} granted nothing for 5 s and is not waited for")
-            check()
-            time.sleep(0.002)
+        if not credits.blocking_consumers(seq):
+            return
+        with playback.held_back():
+            while credits.blocking_consumers(seq):
+                for name in credits.drop_silent(seq):
+                    text = f"{name} granted nothing for 5 s and is not waited for"
+                    self.diagnostics.count("silent_consumers", text=text)
+                check()
+                time.sleep(0.002)
 
     def _on_credit(self, message: Credit) -> None:
         credits = self._credits.get(message.stream_session)

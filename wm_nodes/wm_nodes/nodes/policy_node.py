@@ -41,7 +41,7 @@ HOLD_ARRIVES = Duration(seconds=1)
 PARAMS = (
     Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
     Param("initial_policy", "", "Weights (safetensors) to act with before the learner announces any", read_only=True),
-    Param("step_timeout_s", 10.0, "Deadline of one env/step or env/reset, retries included", "s",
+    Param("step_timeout_s", 10.0, "Deadline of one env/step or env/reset, retries included", "s", read_only=True,
           minimum=0.1, maximum=600.0),
     Param("handshake_timeout_s", 10.0, "Deadline for the environment to answer env/get_spec", "s",
           minimum=0.1, maximum=600.0),
@@ -92,7 +92,7 @@ class PolicyNode(ManagedNode):
                 self, self._holder, self._publish_actions, self._publish_hold, stopped=self._estop
             )
         self._actions = self.publish_on("action", LIVE_ACTION if self._asynchronous else None)
-        self.listen("safety/estop", self._on_estop, while_inactive=True)
+        self.listen_estop(self._on_estop)
         self.listen("env/spec", self._on_spec, while_inactive=True)
         self.listen("policy/version", self._on_version, while_inactive=True)
         self.serve(InferAction, "policy/infer", self._on_infer, counted="refused_infer", code=ErrorCode.BAD_SHAPE)

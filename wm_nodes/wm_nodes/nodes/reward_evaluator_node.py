@@ -38,7 +38,7 @@ PARAMS = (
     Param("model_dir", "", "World-model folder, for the endogenous reward's distance", read_only=True),
     Param("image_wait_s", 1.0, "A transition waits for its images and goals at most so long", "s",
           minimum=0.0, maximum=60.0),
-    Param("summary_period_s", 1.0, "Time between two reward/summary", "s", minimum=0.1, maximum=60.0),
+    Param("summary_period_s", 1.0, "Time between two reward/summary", "s", read_only=True, minimum=0.1, maximum=60.0),
     *services.PARAMS,
 )
 

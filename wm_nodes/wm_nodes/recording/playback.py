@@ -4,6 +4,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosDurability, QosHistory
@@ -66,6 +67,8 @@ class Playback:
         self._rate = 1.0
         self._anchor: tuple[float, int] = (time.monotonic(), self.start_ns)
         self._position_ns = self.start_ns
+        self._taken, self._is_held_back = 0, False
+        """Messages handed to publish(), and whether it holds the newest of them back."""
         self.messages = 0
         self.damaged: list[str] = []
         self.set_rate(rate)
@@ -113,16 +116,34 @@ class Playback:
             self._condition.notify_all()
 
     def play_next(self, count: int, timeout_s: float = 2.0) -> int:
-        """While paused, publish the next `count` messages; return how many were within timeout_s."""
+        """While paused, publish the next `count` messages; return how many were within timeout_s, or until one was held
+        back: that one counts, as it leaves sooner or later."""
         with self._condition:
             if not self._paused:
                 raise BagError("playing; pause before playing single messages")
-            before = self.messages
+            before = self._taken
             self._steps = count
             self._condition.notify_all()
-            self._condition.wait_for(lambda: self._steps == 0 or self._stopped, timeout_s)
+            self._condition.wait_for(
+                lambda: self._is_held_back or self._stopped or (not self._steps and self.messages == self._taken),
+                timeout_s,
+            )
             self._steps = 0
-            return self.messages - before
+            return self._taken - before
+
+    @contextmanager
+    def held_back(self) -> Iterator[None]:
+        """For publish(): while it waits before it publishes, nobody else waits for it in play_next()."""
+        self._set_held_back(True)
+        try:
+            yield
+        finally:
+            self._set_held_back(False)
+
+    def _set_held_back(self, is_held_back: bool) -> None:
+        with self._condition:
+            self._is_held_back = is_held_back
+            self._condition.notify_all()
 
     def stop(self) -> None:
         with self._condition:
@@ -169,10 +190,12 @@ class Playback:
             if not self._wait_for(time_ns, tick, check, say):
                 return False
             tick(time_ns)
+            with self._condition:
+                self._taken += 1
+                self._steps = max(0, self._steps - 1)
             publish(name, data)
             with self._condition:
                 self.messages += 1
-                self._steps = max(0, self._steps - 1)
                 self._position_ns = time_ns
                 self._condition.notify_all()
         self._note_damage(damaged, say)

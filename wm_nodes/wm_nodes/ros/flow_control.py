@@ -1,5 +1,6 @@
 """Back-pressure for keep-all streams: a consumer grants sequence numbers, the producer does not run ahead of them."""
 
+import threading
 import time
 
 from rclpy.clock import Clock, ClockType
@@ -21,41 +22,51 @@ MAX_CONSUMERS = 64
 class ProducerCredits:
     """The producer's side for one stream: who may be waited for, and whether the next message may go out.
 
-    With no consumers there is nothing to wait for. Times are monotonic, in s; pass `now` in tests.
+    With no consumers there is nothing to wait for. Times are monotonic, in s; pass `now` in tests. Thread-safe: the
+    executor takes in messages while a worker asks.
     """
 
     def __init__(self, topic_name: str, session: int) -> None:
         self._topic_name, self._session = topic_name, session
         self._consumers: dict[str, tuple[Credit, float]] = {}
         """The newest message of each, and when it came."""
+        self._lock = threading.Lock()
 
     def note(self, message: Credit, now: float | None = None) -> None:
         """Take in a Credit message; those of other streams or sessions are ignored."""
         if message.topic != self._topic_name or message.stream_session != self._session:
             return
-        self._consumers.pop(message.consumer, None)  # the newest last
-        self._consumers[message.consumer] = message, time.monotonic() if now is None else now
-        if len(self._consumers) > MAX_CONSUMERS:
-            del self._consumers[next(iter(self._consumers))]
+        with self._lock:
+            self._consumers.pop(message.consumer, None)  # the newest last
+            self._consumers[message.consumer] = message, time.monotonic() if now is None else now
+            if len(self._consumers) > MAX_CONSUMERS:
+                del self._consumers[next(iter(self._consumers))]
 
     def remove(self, consumer: str) -> None:
-        self._consumers.pop(consumer, None)
+        with self._lock:
+            self._consumers.pop(consumer, None)
 
     def blocking_consumers(self, next_seq: int) -> list[str]:
         """Return the consumers that have not granted `next_seq` yet; empty: publish."""
-        return [name for name, (credit, _) in self._consumers.items() if credit.granted_seq < next_seq]
+        with self._lock:
+            return self._blocking(next_seq)
 
     def drop_silent(self, next_seq: int, now: float | None = None) -> list[str]:
         """Drop and return the consumers that hold the producer up and were silent for SILENT_S."""
         now = time.monotonic() if now is None else now
-        gone = [name for name in self.blocking_consumers(next_seq) if now - self._consumers[name][1] > SILENT_S]
-        for name in gone:
-            del self._consumers[name]
+        with self._lock:
+            gone = [name for name in self._blocking(next_seq) if now - self._consumers[name][1] > SILENT_S]
+            for name in gone:
+                del self._consumers[name]
         return gone
 
     @property
     def consumers(self) -> list[str]:
-        return sorted(self._consumers)
+        with self._lock:
+            return sorted(self._consumers)
+
+    def _blocking(self, next_seq: int) -> list[str]:
+        return [name for name, (credit, _) in self._consumers.items() if credit.granted_seq < next_seq]
 
 
 class ConsumerCredits:

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -28,7 +29,7 @@ from wm_nodes.ros.guard import Guard
 from wm_nodes.ros.liveliness import HEARTBEAT_S, Heartbeat, PeerWatch
 from wm_nodes.ros.params import COMMON, Param, declare, refusal
 from wm_nodes.ros.publishing import StampedPublisher
-from wm_nodes.ros.qos import topic
+from wm_nodes.ros.qos import ANY_PUBLISHER, topic
 from wm_nodes.ros.sequence_numbers import GapTracker, new_session
 
 T = TypeVar("T")
@@ -45,7 +46,8 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     configure() builds objects, publishers, subscriptions and services; cleanup() lets go of what configure() made
     (entities made through publish_on, listen, serve are destroyed here). The four raise on failure: one of REFUSALS
-    leaves the state as it was with one error line; anything else goes through error processing to `unconfigured`.
+    leaves the state as it was with one error line, but never holds up cleanup(); anything else goes through error
+    processing to `unconfigured`. cleanup() also follows a configure() that failed half-way.
     """
 
     def __init__(self, name: str, params: Sequence[Param] = (), **node_arguments: Any) -> None:
@@ -202,6 +204,15 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             self.own(credits.close)
         return credits
 
+    def listen_estop(self, callback: Callable[[Any], None]) -> None:
+        """Hear safety/estop until cleanup, active or not: what was latched before, and publishers of any QoS, which a
+        latched reader does not match. The callback may get a message twice; received and dropped are counted under the
+        topic's relative and its absolute name."""
+        row, quiet = topic("safety/estop"), SubscriptionEventCallbacks(use_default_callbacks=False)
+        for name, qos in ((row.name, row.reader_qos), (self.resolve_topic_name(row.name), ANY_PUBLISHER)):
+            subscription = self.create_subscription(row.type, name, callback, qos, event_callbacks=quiet)
+            self.own(self.destroy_subscription, subscription)
+
     def serve(
         self, service_type: type[Any], name: str, callback: Callable[[Any, Any], Any], *, counted: str = "",
         code: int = ErrorCode.IO_ERROR,
@@ -270,7 +281,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self.session = new_session()
         result = self._attempt("configure", self.configure)
         if result == TransitionCallbackReturn.FAILURE:
-            self._release()
+            self._let_go()
         return result
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -291,9 +302,9 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         return result
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        result = self._attempt("cleanup", self.cleanup)
+        result, done = self._attempt("cleanup", self.cleanup), TransitionCallbackReturn.SUCCESS
         self._release()
-        return result
+        return done if result == TransitionCallbackReturn.FAILURE else result  # nothing is left to clean up
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         if self._active:
@@ -326,6 +337,14 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self.get_logger().error(f"{action} failed: {text or type(error).__name__}")
         self.diagnostics.set_condition("lifecycle", diagnostics.ERROR, f"{action} failed: {text}")
         return result
+
+    def _let_go(self) -> None:
+        """Clean up after a configure() that failed, whose reason stays in diagnostics; a further error is logged."""
+        try:
+            self.cleanup()
+        except Exception:
+            self.get_logger().error(f"cleanup failed: {traceback.format_exc()}")
+        self._release()
 
     def _release(self) -> None:
         self._introspected.clear()

@@ -1,5 +1,7 @@
 """The environment's own clock: which action a step takes, when it holds, what it refuses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,9 +9,10 @@ pytest.importorskip("wm_msgs.msg", reason="wm_msgs is not built")
 
 from graph.toy import ReachToy
 
-from wm_msgs.msg import ErrorCode
+from wm_msgs.msg import EpisodeEvent, ErrorCode
 from wm_nodes.core.errors import WireError
 from wm_nodes.core.lockstep import Goals, LockStep
+from wm_nodes.core.specs import SOURCE_IMAGINED, SOURCE_REAL, SOURCE_SIMULATOR
 from wm_nodes.core.types import FloatArray, StepResult, UInt8Array
 from wm_nodes.nodes.environment.asynchronous import AsynchronousEnvironment
 from wm_nodes.nodes.environment.lockstep import LockstepEnvironment
@@ -39,12 +42,36 @@ class Published:
 
 
 class Bench:
-    def __init__(self) -> None:
+    """source: EnvSpec.SOURCE_* of the environment."""
+
+    def __init__(self, source: int = SOURCE_SIMULATOR) -> None:
         self.now = 0.0
         self.published = Published()
-        self.served = LockstepEnvironment(ReachToy(N, seed=1), 7, self.published)
+        toy = ReachToy(N, seed=1)
+        toy.spec = replace(toy.spec, source=source)
+        self.served = LockstepEnvironment(toy, 7, self.published)
+        self.moved = self._noted(toy)
         self.environment = AsynchronousEnvironment(self.served, lambda: 0.25, lambda: self.now)
         self.environment.start()
+
+    @staticmethod
+    def _noted(toy: ReachToy) -> list[FloatArray]:
+        """The actions of the steps that the environment makes from now on."""
+        moved, step = list[FloatArray](), toy.step
+
+        def note(actions: FloatArray) -> StepResult:
+            moved.append(actions)
+            return step(actions)
+
+        toy.step = note  # type: ignore[method-assign]
+        return moved
+
+    def refuse_credit(self, refused: bool) -> None:
+        def wait() -> None:
+            if refused:
+                raise WireError(ErrorCode.BUSY, "waiting for /wm/learner")
+
+        self.served.before_step = wait
 
     def tick(self) -> bool:
         self.now += 0.1
@@ -126,17 +153,10 @@ def test_a_reset_by_request_takes_the_place_of_the_one_that_was_due(bench: Bench
 def test_an_emergency_stop_holds_at_once_and_neither_keeps_nor_takes_an_action(bench: Bench) -> None:
     bench.offer(0.5)
     bench.tick()
-    count, moved = len(bench.published.transitions), list[np.ndarray]()
-    step = bench.served.environment.step
-
-    def note(actions: FloatArray) -> StepResult:
-        moved.append(actions)
-        return step(actions)
-
-    bench.served.environment.step = note  # type: ignore[method-assign]
+    count, made = len(bench.published.transitions), len(bench.moved)
     bench.served.estop = True
     bench.environment.stop()
-    assert len(moved) == 1 and not moved[0].any() and len(bench.published.transitions) == count
+    assert len(bench.moved) == made + 1 and not bench.moved[-1].any() and len(bench.published.transitions) == count
     with pytest.raises(WireError, match="emergency stop") as refused:
         bench.offer(0.5)
     assert refused.value.code == ErrorCode.ESTOP
@@ -153,3 +173,62 @@ def test_the_emergency_stop_and_missing_credit_leave_the_environment_as_it_is(be
     bench.served.estop = False
     bench.tick()
     assert len(bench.published.transitions) == count + 1
+
+
+def test_what_is_imagined_stands_still_and_is_not_told_to_hold() -> None:
+    bench = Bench(SOURCE_IMAGINED)
+    bench.environment.stop()
+    assert not bench.moved
+
+
+def test_a_robot_holds_once_while_it_waits_for_credit_and_its_episode_goes_on_without_a_gap() -> None:
+    bench = Bench(SOURCE_REAL)
+    bench.offer(0.5)
+    bench.tick()
+    bench.refuse_credit(True)
+    for _ in range(3):
+        with pytest.raises(WireError, match="waiting for /wm/learner"):
+            bench.tick()
+    assert [float(actions[0, 0]) for actions in bench.moved] == [0.5, 0.0]
+    bench.refuse_credit(False)
+    bench.tick()
+    bench.refuse_credit(True)
+    with pytest.raises(WireError, match="waiting for /wm/learner"):
+        bench.tick()
+    assert len(bench.moved) == 4, "each wait has its own hold"
+    bench.refuse_credit(False)
+    bench.tick()
+    assert [step.episode_steps[0] for step in bench.published.transitions] == [0, 0, 1, 2]
+
+
+def test_an_episode_that_ends_as_its_robot_holds_is_reset_in_the_next_step() -> None:
+    bench = Bench(SOURCE_REAL)
+    for _ in range(11):
+        bench.tick()
+    bench.refuse_credit(True)
+    with pytest.raises(WireError, match="waiting for /wm/learner"):
+        bench.tick()
+    bench.refuse_credit(False)
+    bench.tick()
+    assert not bench.last.valid.any()
+    bench.tick()
+    assert bench.last.valid.all() and (bench.last.episode_steps == 0).all()
+
+
+def test_an_episode_with_a_hold_that_reaches_its_last_step_has_met_the_time_limit() -> None:
+    bench = Bench(SOURCE_REAL)
+    bench.refuse_credit(True)
+    with pytest.raises(WireError, match="waiting for /wm/learner"):
+        bench.tick()
+    bench.refuse_credit(False)
+    for _ in range(11):
+        bench.tick()
+    ends = [note.reason for note in bench.published.notes if note.kind == EpisodeEvent.KIND_END]
+    assert ends == [EpisodeEvent.REASON_TIME_LIMIT] * N
+
+
+def test_a_simulator_that_waits_for_credit_stands_still(bench: Bench) -> None:
+    bench.refuse_credit(True)
+    with pytest.raises(WireError, match="waiting for /wm/learner"):
+        bench.tick()
+    assert not bench.moved

@@ -37,6 +37,7 @@ class AsynchronousEnvironment:
         self._newest: tuple[TimedAction, float] | None = None
         self._published: OrderedDict[int, float] = OrderedDict()
         self._ended = np.zeros(served.spec.num_envs, bool)
+        self._is_waiting = False
 
     def start(self) -> None:
         """Reset every environment and publish the first observation. Raises WireError."""
@@ -75,7 +76,7 @@ class AsynchronousEnvironment:
         self._newest = None
 
     def stop(self) -> None:
-        """Hold at once, after the emergency stop was set: the next step may never come. Raises WireError."""
+        """Hold at once: the next step may never come. Raises WireError."""
         self.hold()
         self._served.hold_now()
 
@@ -83,8 +84,8 @@ class AsynchronousEnvironment:
         """Step once; return False when it had to hold for want of an action.
 
         Raises:
-            WireError: BUSY (no credit) and ESTOP, where nothing has changed; NAN_MODEL and INTERNAL, after
-                which all are reset.
+            WireError: BUSY (no credit) and ESTOP, where nothing has changed but that a robot holds; NAN_MODEL and
+                INTERNAL, after which all are reset.
         """
         action = None
         if self._newest is not None and self._clock() - self._newest[1] <= self._max_age_s():
@@ -103,12 +104,21 @@ class AsynchronousEnvironment:
         try:
             reply = self._served.step(command)
         except WireError as error:
+            if error.code == ErrorCode.BUSY:
+                self._wait()
             if error.code in (ErrorCode.NAN_MODEL, ErrorCode.INTERNAL):
                 self._ended[:] = True
             raise
+        self._is_waiting = False
         self._ended = reply.terminated | reply.truncated
         self._note(reply.stamp_ns)
         return action is not None or bool(reset is not None and reset.all())
+
+    def _wait(self) -> None:
+        """Have a robot hold, once for each wait for credit, since every hold shortens its episode. Raises WireError."""
+        if self._served.is_robot and not self._is_waiting:
+            self._ended |= self._served.hold_now()
+            self._is_waiting = True
 
     def _note(self, stamp_ns: int) -> None:
         self._published[stamp_ns] = self._clock()

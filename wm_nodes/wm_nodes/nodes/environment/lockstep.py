@@ -18,7 +18,7 @@ from wm_msgs.msg import EpisodeEvent, ErrorCode
 from wm_nodes.core.errors import WireError
 from wm_nodes.core.lockstep import Goals, LockStep
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.specs import SOURCE_IMAGINED, SOURCE_REAL, EnvironmentSpec
 from wm_nodes.core.tool_control import hold_actions
 from wm_nodes.core.types import BoolArray, Environment, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 from wm_nodes.nodes.environment.running_episodes import RunningEpisodes
@@ -190,15 +190,27 @@ class LockstepEnvironment:
                 raise self._last_reply
             return self._last_reply
 
-    def hold_now(self) -> None:
-        """Have a robot hold, which without further steps might go on with its last action, outside of any step.
+    @property
+    def is_robot(self) -> bool:
+        """Whether it may go on with its last action between two steps; what is computed stands still."""
+        return self.spec.source == SOURCE_REAL
+
+    def hold_now(self) -> BoolArray:
+        """Have a robot hold, which without further steps might go on with its last action, outside of any step; what is
+        imagined is left alone.
+
+        Returns:
+            (N,), whether the episode ended as it held: its environment stays put until it is reset.
 
         Raises:
             WireError: INTERNAL, NAN_MODEL: the environment failed.
         """
         with self._lock, self._environment_errors():
-            if self._current is not None:
-                self.environment.step(self.hold_actions())
+            if self._current is None or self.spec.source == SOURCE_IMAGINED:
+                return np.zeros(self.spec.num_envs, bool)
+            result = self.environment.step(self.hold_actions())
+            self._episodes.count_hold()
+            return result.terminated | result.truncated
 
     def hold_actions(self) -> FloatArray:
         """Actions (N, A) that leave every tool where it is commanded to be; zeros before the first reset."""
@@ -276,7 +288,7 @@ class LockstepEnvironment:
             logprobs=unknown if command.logprobs is None else command.logprobs,
             values=unknown if command.values is None else command.values, terminated=result.terminated & valid,
             truncated=result.truncated & valid, valid=valid, episode_ids=before.episode_id,
-            episode_steps=before.episode_step,
+            episode_steps=self._episodes.lengths,
             policy_versions=np.full(self.spec.num_envs, command.policy_version, np.uint64),
             success_probability=np.where(valid, result.success_probability, 0).astype(np.float32),
             uncertainty=result.uncertainty,
@@ -361,7 +373,7 @@ class LockstepEnvironment:
             session=self.session, step_id=self._last_step_id, stamp_ns=stamp, next_stamp_ns=stamp,
             actions=np.zeros((count, self.spec.action_dim), np.float32), states=current.state,
             next_states=current.state, logprobs=unknown, values=unknown, terminated=none, truncated=none, valid=none,
-            episode_ids=current.episode_id, episode_steps=current.episode_step,
+            episode_ids=current.episode_id, episode_steps=self._episodes.lengths,
             policy_versions=np.zeros(count, np.uint64), success_probability=zeros, uncertainty=zeros,
             ground_truth=self._truth(), source=self.spec.source,
         )

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from wm_msgs.msg import EpisodeEvent
 from wm_nodes.core.lockstep import LockStep
@@ -25,6 +26,8 @@ class _Slot:
     """Ended from outside (estop, error, stop): nothing it does counts until it is reset."""
     length: int = 0
     """Steps made."""
+    holds: int = 0
+    """Steps in which a robot held, which are in no transition."""
     version_first: int = 0
     """Policy version of its first step."""
     version_last: int = 0
@@ -52,6 +55,16 @@ class RunningEpisodes:
     def aborted(self) -> BoolArray:
         return np.array([slot.aborted for slot in self._slots])
 
+    @property
+    def lengths(self) -> NDArray[np.uint32]:
+        """(N,), steps made, holds not among them."""
+        return np.array([slot.length for slot in self._slots], np.uint32)
+
+    def count_hold(self) -> None:
+        """Note a step in which every robot held, outside of any transition; it counts towards the limit alone."""
+        for slot in self._slots:
+            slot.holds += 1
+
     def start(self, mask: BoolArray, episode_ids: UInt64Array, seeds: UInt64Array, stamp_ns: int) -> None:
         """Episodes (N,) of these ids and seeds began where mask is True."""
         begin = EpisodeEvent.KIND_START, EpisodeEvent.OUTCOME_UNKNOWN, EpisodeEvent.REASON_NONE
@@ -69,7 +82,7 @@ class RunningEpisodes:
             if step.terminated[i]:
                 self._end(i, EpisodeEvent.OUTCOME_SUCCESS, EpisodeEvent.REASON_TERMINAL, step.next_stamp_ns)
             elif step.truncated[i]:
-                at_limit = slot.length >= self._max_steps
+                at_limit = slot.length + slot.holds >= self._max_steps
                 reason = EpisodeEvent.REASON_TIME_LIMIT if at_limit else EpisodeEvent.REASON_UNCERTAINTY
                 self._end(i, EpisodeEvent.OUTCOME_FAILURE, reason, step.next_stamp_ns)
 

@@ -1,0 +1,49 @@
+"""The player and the credit of its consumers, over DDS."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from graph.test_recorder_player import Listener, Start, live_graph, peer, recorded, replay
+from recording_graph import write
+
+from wm_msgs.msg import Credit, TransitionBatch
+from wm_msgs.srv import PlayNext
+from wm_nodes.ros import qos as table
+
+__all__ = ["peer"]
+
+pytestmark = pytest.mark.graph
+
+
+def test_single_messages_are_played_to_a_consumer_with_credit_without_a_wait_and_without_a_gap(
+    domain: int, tmp_path: Path, peer: Start
+) -> None:
+    path = write(tmp_path / "bag", live_graph(60))
+    player = peer(domain, "player_node", tmp_path, start_paused=True)
+    listener, row = Listener(player, path), table.topic("flow/credit")
+    credits = player.node.create_publisher(Credit, row.name, row.qos)
+
+    def grant(message: TransitionBatch) -> None:
+        credits.publish(Credit(
+            consumer="/wm/peer", topic="env/transition", stream_session=message.session, received_seq=message.seq,
+            granted_seq=message.seq + 16,
+        ))
+
+    transition = table.topic("env/transition")
+    player.node.create_subscription(TransitionBatch, "env/transition", grant, transition.qos)
+    replay(player, feedback := list[Any](), bag_uri="bag", rate=1.0)
+    player.wait(lambda: feedback, "feedback")
+    total, short_s = sum(map(len, recorded(path).values())) - 5, list[float]()
+    told = [player.call(PlayNext, "player/play_next", num_messages=20).played]
+    player.wait(lambda: len(listener.order) == 20, "the first messages, for which credit is granted")
+    while sum(told) < total:
+        began, asked = time.monotonic(), min(200, total - sum(told))
+        told.append(player.call(PlayNext, "player/play_next", num_messages=asked).played)
+        if told[-1] < asked:
+            short_s.append(time.monotonic() - began)
+        assert len(told) < 60, told
+    assert short_s, "credit was waited for"
+    assert min(short_s) < 2.0, "the executor, which brings the credit, did not wait for it"
+    player.wait(lambda: len(listener.order) == total, "every message")
