@@ -120,7 +120,10 @@ class Graph:
             success_probability=success, episode_id=old_id, episode_step=old_step,
         )
         self.publish(topics.TRANSITION, message)
-        self.rewards.append((self.step_id + self.reward_lag, self.reward(row, stamp_ns)))
+        if reset.all():
+            row["rewards"][:] = np.nan  # nobody stepped: the evaluator says nothing
+        else:
+            self.rewards.append((self.step_id + self.reward_lag, self.reward(row, stamp_ns)))
         self.flush_rewards(self.step_id)
         self.episode_step[~reset] += 1
         for index in np.flatnonzero(row["truncated"]):

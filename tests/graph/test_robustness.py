@@ -1,5 +1,6 @@
 """Nodes when something breaks inside them: the model, the renderer, a callback, the disk, the clock, a lifecycle."""
 
+import json
 import resource
 import subprocess
 import sys
@@ -191,14 +192,19 @@ def test_a_full_disk_stops_recording_with_one_error_nothing_flushed_is_lost_and_
     assert "free disk space" in log
     assert log.count("recording stopped") == 1
     assert "Traceback" not in log
-    bag = graph.folder / "bags" / "full"
-    assert _count(bag if bag.exists() else partial, "env/transition") >= 2
+    assert f"the bag is unfinished: {partial}" in log and "is complete" not in log
+    assert not (graph.folder / "bags" / "full").exists()
+    assert not (graph.folder / "bags.json").exists()
+    assert _count(partial, "env/transition") >= 2
+    stop = probe.call(StopRecording, "recorder/stop", StopRecording.Request())
+    assert stop.error_code == ErrorCode.NOT_ACTIVE
     full_disk(process)
     again = probe.call(StartRecording, "recorder/start", StartRecording.Request(bag_uri="bags/again"))
     assert (again.error_code, again.message) == (ErrorCode.OK, "")
     client.reset()
     wait_until("messages", lambda: _count(graph.folder / "bags" / "again.partial", "env/transition") >= 1)
     assert probe.call(StopRecording, "recorder/stop", StopRecording.Request()).messages >= 1
+    assert [row["bag"] for row in json.loads((graph.folder / "bags.json").read_text())] == ["bags/again"]
 
 
 def _size(folder: Path) -> int:

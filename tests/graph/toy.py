@@ -19,7 +19,7 @@ from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, 
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
 from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.train import train_policy
-from wm_nodes.reward import RuleReward
+from wm_nodes.reward import RewardInput, RewardResult, RuleReward
 from wm_nodes.training.weights import pack_weights, unpack_weights
 
 SIDE_PX = 16
@@ -284,3 +284,22 @@ def make_stuck_learner(policy: ImagePolicy, config: RunConfig) -> Any:
 
     learner.update = update  # type: ignore[method-assign]
     return learner
+
+
+class FailingReward(RuleReward):
+    """Raises at every second step, and then gives one reward too few, in turn."""
+
+    def __init__(self) -> None:
+        super().__init__(1.0)
+        self._calls = 0
+
+    def evaluate(self, step: RewardInput) -> RewardResult:
+        self._calls += 1
+        if self._calls % 2:
+            raise KeyError("no such part")
+        result = super().evaluate(step)
+        return replace(result, total=result.total[1:])
+
+
+def make_failing_reward(config: RunConfig) -> FailingReward:
+    return FailingReward()

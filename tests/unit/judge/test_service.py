@@ -28,6 +28,7 @@ from wm_nodes.core.lockstep import LockStep
 from wm_nodes.core.named_files import NamedFiles, OutsideFolders
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.agent.verdict import Verdict
+from wm_nodes.judge.audit.media import FOLDER
 from wm_nodes.judge.audit.reading import read_record
 from wm_nodes.judge.backends.factory import check_judge
 from wm_nodes.judge.episode_reward import EpisodeReward, PendingReward, check_horizon, unjudged_reason
@@ -255,6 +256,22 @@ def test_a_judge_that_is_down_leaves_the_last_step_without_a_reward_and_says_why
         result = wait_for(EpisodeReward(judge).add(step(0, ended=(True, True)), SPEC)).result()
         assert not result.valid.any() and np.isnan(result.total).all()
         assert "environment 1: ERROR PLAN" in result.invalid_reason and "connection failed" in result.invalid_reason
+
+
+@pytest.mark.parametrize("fails", ["audit", "judge"])
+def test_whatever_goes_wrong_in_the_judging_is_a_last_step_without_a_reward(
+    server: PickyServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: str
+) -> None:
+    with closing(JudgeService(settings(server), seed=0, audit=tmp_path)) as judge:
+        if fails == "audit":
+            (tmp_path / FOLDER).write_text("no folder: no picture can be stored")
+        else:
+            monkeypatch.setattr(judge, "_evaluate", lambda *_: {}["no such judge"])
+        pending = wait_for(EpisodeReward(judge).add(step(0, ended=(True, False)), SPEC))
+        result, error = pending.result(), {"audit": "NotADirectoryError: ", "judge": "KeyError: 'no such judge'"}[fails]
+        assert list(result.valid) == [False, True] and np.isnan(result.total[0]) and result.total[1] == 0
+        assert result.invalid_reason.startswith(f"environment 0: {error}")
+        assert pending.problems()[0].startswith(error) and not pending.verdicts()
 
 
 # Settings

@@ -252,3 +252,38 @@ def test_a_closed_or_unknown_topic_write_is_refused(tmp_path: Path) -> None:
     bag.close()
     with pytest.raises(BagError, match="is closed"):
         bag.write("/wm/reward", b"", 0)
+
+
+def numbered(bag: RawBagWriter, count: int) -> RawBagWriter:
+    bag.add_topic(TOPIC, "wm_msgs/msg/Credit")
+    for number in range(count):
+        bag.write(TOPIC, credit(number), 1 + number)
+    return bag
+
+
+def test_a_next_file_that_cannot_be_opened_ends_the_bag_and_what_was_written_is_recoverable(tmp_path: Path) -> None:
+    bag = numbered(RawBagWriter(tmp_path / "bag"), 3)
+    (tmp_path / "bag.partial" / "bag_1.mcap").touch()
+    with pytest.raises(RecordingError, match=r"bag\.partial failed after 3 messages: File exists; .*wm recover-bag"):
+        bag.split()
+    with pytest.raises(RecordingError, match=r"bag is unfinished: .*bag\.partial"):
+        bag.close()
+    assert not (tmp_path / "bag").exists()
+    assert recover(tmp_path / "bag.partial").topics == {TOPIC: 3}
+
+
+def test_a_message_that_fills_a_file_whose_successor_cannot_be_opened_is_in_the_bag(tmp_path: Path) -> None:
+    bag = numbered(RawBagWriter(tmp_path / "bag", chunk_bytes=100, split_bytes=10_000), 1)
+    (tmp_path / "bag.partial" / "bag_1.mcap").touch()
+    with pytest.raises(RecordingError, match="File exists"):
+        numbered(bag, 10_000)
+    assert recover(tmp_path / "bag.partial").topics == {TOPIC: bag.messages}
+
+
+def test_a_bag_whose_writing_was_given_up_is_not_closed_as_if_it_were_complete(tmp_path: Path) -> None:
+    bag = numbered(RawBagWriter(tmp_path / "bag"), 3)
+    bag.abort()
+    with pytest.raises(RecordingError, match=r"bag is unfinished: .*bag\.partial"):
+        bag.close()
+    done = numbered(RawBagWriter(tmp_path / "done"), 3)
+    assert done.close() == done.close() == tmp_path / "done"

@@ -1,5 +1,6 @@
 """Recordings of a live graph: several environments in one mosaic, rewards that lag, resets, losses, restarts."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,8 +9,9 @@ import pytest
 from recording_graph import NUM_ENVS, PERIOD_NS, Graph, assert_same_rollout, write
 from recording_samples import make_spec
 
-from wm_nodes.recording import BagError, BagReport, read_episodes, read_rollouts, read_spec, topics
+from wm_nodes.recording import Bag, BagError, BagReport, read_episodes, read_rollouts, read_spec, topics
 from wm_nodes.recording import messages as m
+from wm_nodes.recording.join import MAX_LAG, LockSteps
 from wm_nodes.recording.layout import Tiles
 
 
@@ -47,6 +49,37 @@ def test_rewards_a_whole_rollout_late_still_join(tmp_path: Path, graph: Graph) -
     graph.rollout(1, 50)
     (found,) = read_rollouts(write(tmp_path / "bag", graph))
     assert_same_rollout(found, graph.rollouts[0])
+
+
+def test_rewards_that_come_at_the_end_of_long_rollouts_still_join(tmp_path: Path, graph: Graph) -> None:
+    prompt = Graph(graph.spec)
+    graph.reward_lag = 10**6
+    for each in (graph, prompt):
+        for version in (1, 2):
+            each.rollout(version, 120)
+            each.flush_rewards(10**9)
+    path = write(tmp_path / "bag", graph)
+    for ours, theirs in zip(read_rollouts(path, num_steps=120), graph.rollouts, strict=True):
+        assert_same_rollout(ours, theirs)
+    episodes, same = list(read_episodes(path)), list(read_episodes(write(tmp_path / "prompt", prompt)))
+    assert sum(episode.num_steps for episode in episodes) > 400
+    for episode, expected in zip(episodes, same, strict=True):
+        np.testing.assert_array_equal(episode.rewards, expected.rewards)
+
+
+@pytest.mark.parametrize("lost", [lambda step_id: step_id == 5, lambda step_id: step_id > 5])
+def test_lost_rewards_hold_no_more_lock_steps_back_than_other_losses(
+    tmp_path: Path, graph: Graph, lost: Callable[[int], bool]
+) -> None:
+    graph.rollout(1, 300)
+    path = write(tmp_path / "bag", graph, drop=lambda topic, x: topic is topics.REWARD and lost(x.step_id))
+    with Bag(path) as bag:
+        steps = LockSteps(bag)
+        taken = [(step, len(steps._joiner._waiting)) for step in steps]
+    assert len(taken) == 301
+    for step, num_waiting in taken:
+        assert (step.rewards is None) == (lost(step.step_id) or not step.valid.any())
+        assert num_waiting <= MAX_LAG
 
 
 def test_live_episodes_carry_frame_zero_truth_and_the_events_labels(tmp_path: Path, graph: Graph) -> None:

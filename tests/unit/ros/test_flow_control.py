@@ -2,6 +2,7 @@
 
 import sys
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -218,6 +219,53 @@ def test_locksteps_leave_in_order_when_they_are_complete_or_too_late() -> None:
         joiner.put_image(10 * step_id, images(step_id))
     assert [joined.step_id for joined in joiner.take(max_behind=2)] == [1]
     assert [(joined.step_id, joined.images is None) for joined in joiner.take(max_behind=1)] == [(2, True), (3, False)]
+
+
+def waiting(joiner: Joiner, last: int) -> Joiner:
+    """The reset lock-step 0 and lock-steps 1 to `last`, with images and without rewards."""
+    joiner.put_image(10, images(1))
+    joiner.put_step(replace(step(0, valid=False), stamp_ns=10, next_stamp_ns=10))
+    for step_id in range(1, last + 1):
+        joiner.put_image(10 * (step_id + 1), images(step_id % 256))
+        joiner.put_step(step(step_id))
+    return joiner
+
+
+def test_rewards_that_come_after_a_whole_rollout_are_waited_for() -> None:
+    joiner = waiting(Joiner(with_rewards=True), 120)
+    assert [joined.step_id for joined in joiner.take(max_behind=64)] == [0]
+    found = list[LockStep]()
+    for step_id in range(1, 121):
+        joiner.put_rewards(rewards(step_id))
+        found += joiner.take(max_behind=64)
+    assert [joined.rewards.total[0] for joined in found if joined.rewards] == list(range(1, 121))
+    assert all(joined.images is not None for joined in found)
+
+
+def test_rewards_from_before_a_reset_are_waited_for_a_little_after_it() -> None:
+    joiner = waiting(Joiner(with_rewards=True), 5)
+    assert len(list(joiner.take(max_behind=4))) == 1
+    joiner.put_step(replace(step(5, valid=False), stamp_ns=60, next_stamp_ns=60))
+    for step_id in (6, 7, 8):
+        joiner.put_image(10 * (step_id + 1), images(step_id))
+        joiner.put_step(step(step_id))
+    joiner.put_rewards(rewards(1))
+    assert [joined.rewards is not None for joined in joiner.take(max_behind=4)] == [True]
+    joiner.put_step(step(9))
+    given = [(joined.step_id, joined.rewards is not None) for joined in joiner.take(max_behind=4)]
+    assert given == [(2, False), (3, False), (4, False), (5, False), (5, False)]
+
+
+def test_rewards_that_were_lost_hold_nothing_back_where_later_ones_come_or_none_do() -> None:
+    joiner = waiting(Joiner(with_rewards=True), 6)
+    assert len(list(joiner.take(max_behind=4))) == 1
+    for step_id in (2, 3):
+        joiner.put_rewards(rewards(step_id))
+    given = [(joined.step_id, joined.rewards is not None) for joined in joiner.take(max_behind=4)]
+    assert given == [(1, False), (2, True), (3, True)]
+    assert list(joiner.take(max_behind=4)) == []
+    joiner.end_rewards()
+    assert [joined.step_id for joined in joiner.take(max_behind=4)] == [4, 5, 6]
 
 
 def test_goals_are_waited_for_until_it_is_clear_that_nobody_publishes_them() -> None:

@@ -1,5 +1,6 @@
 """What a broken or hostile sender may put into messages: every reader returns a value or raises one WireError."""
 
+import math
 import random
 import time
 from collections.abc import Callable
@@ -14,7 +15,17 @@ from message_generator import MessageGenerator
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 
-from wm_msgs.msg import ActionBatch, Credit, EnvSpec, ErrorCode, PolicyVersion, RewardBatch, TaskGoal, TransitionBatch
+from wm_msgs.msg import (
+    ActionBatch,
+    Credit,
+    EnvSpec,
+    ErrorCode,
+    PolicyVersion,
+    RewardBatch,
+    RewardSummary,
+    TaskGoal,
+    TransitionBatch,
+)
 from wm_msgs.srv import ResetBatch, StepBatch
 from wm_nodes.config.load import load_config
 from wm_nodes.core.errors import WireError
@@ -145,6 +156,20 @@ def test_episodes_that_never_end_take_no_memory(monkeypatch: pytest.MonkeyPatch)
         ids = np.arange(N, dtype=np.uint64) + number * N
         window.add(convert.transition_of(convert.transition_msg(_renamed(ids)), SPEC), REWARDS)
     assert len(window._returns) == 2 * N
+
+
+def test_a_summary_of_invalid_rewards_has_no_means_and_says_how_many_there_are() -> None:
+    window = summary.SummaryWindow()
+    assert window.take() is None
+    window.add(TRANSITION, replace(REWARDS, valid=np.zeros(N, bool)))
+    values = window.take()
+    assert values is not None and values["invalid"] == TRANSITION.valid.sum() > 0
+    none = ("mean_total", "mean_dense", "mean_sparse", "min_total", "max_total")
+    assert all(math.isnan(values[name]) for name in none)
+    assert RewardSummary(**values).invalid == values["invalid"]
+    assert not window._rewards and window.take() is None
+    window.invalid += 3  # lock-steps that were missed
+    assert (window.take() or {})["invalid"] == 3
 
 
 def _renamed(ids: Any) -> LockStep:

@@ -8,7 +8,7 @@ of its last state. An episode that ended has the verdict's reward and no bootstr
 Shapes: N environments, T steps of an episode, H W 3 image, A action.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 
@@ -68,19 +68,22 @@ class PendingReward:
 
     def verdicts(self) -> dict[int, Verdict]:
         """The verdicts by environment; call it only when done."""
-        return {n: outcome.result() for n, outcome in self.waited.items() if not isinstance(outcome, str)}
+        return {n: verdict for n, verdict in self._outcomes() if not isinstance(verdict, str)}
+
+    def problems(self) -> dict[int, str]:
+        """Why the other environments whose episode ended have none; call it only when done."""
+        return {n: reason for n, reason in self._outcomes() if isinstance(reason, str)}
 
     def result(self) -> RewardResult:
         """The rewards: 0 within an episode, the verdict's at its last step, invalid without one; call it when done."""
         total, valid, reasons = np.zeros(len(self.valid), np.float32), self.valid.copy(), list[str]()
-        for n, outcome in self.waited.items():
-            verdict = None if isinstance(outcome, str) else outcome.result()
-            if verdict is None or not verdict.valid:
+        for n, outcome in self._outcomes():
+            if isinstance(outcome, str) or not outcome.valid:
                 valid[n] = False
-                reason = outcome if verdict is None else f"{verdict.status} {verdict.reason}"
+                reason = outcome if isinstance(outcome, str) else f"{outcome.status} {outcome.reason}"
                 reasons.append(f"environment {n}: {reason}")
             else:
-                total[n] = verdict.reward
+                total[n] = outcome.reward
         total = np.where(valid, total, np.float32(np.nan)).astype(np.float32)
         none = np.where(valid, np.float32(0), np.float32(np.nan)).astype(np.float32)
         return RewardResult(
@@ -88,6 +91,14 @@ class PendingReward:
             success=np.full(len(valid), SUCCESS_UNKNOWN, np.uint8), invalid_reason="; ".join(reasons),
             components={"dense": none, "sparse": total}, weights={"dense": 0.0, "sparse": 1.0},
         )
+
+    def _outcomes(self) -> Iterator[tuple[int, Verdict | str]]:
+        """The verdict of each environment, or why there is none: what went wrong in the judging is a reason, too."""
+        for n, outcome in self.waited.items():
+            try:
+                yield n, outcome if isinstance(outcome, str) else outcome.result()
+            except Exception as error:
+                yield n, f"{type(error).__name__}: {error}"
 
 
 def check_agent(config: RunConfig, *, trains: bool = True) -> None:

@@ -53,7 +53,7 @@ def judge_bag(path: Path, judge: JudgeService, *, namespace: str | None = None) 
     for step, pending in waiting:
         result = pending.result()
         judged.verdicts += pending.verdicts().values()
-        judged.unseen += [reason for reason in pending.waited.values() if isinstance(reason, str)]
+        judged.unseen += pending.problems().values()
         place = step.session, step.step_id
         judged.results[place] = result
         if step.rewards is not None and step.rewards.version == model.version:

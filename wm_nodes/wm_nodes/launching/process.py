@@ -121,8 +121,9 @@ class NodeProcess:
                     sink.write(line)
                     sink.flush()
                 if self._log is not None:
-                    self._log.write(f"{self._prefix}{line.rstrip()}\n")
-                    self._log.flush()
+                    with suppress(OSError):  # its reader has gone, e.g. `| head`; the file and the node go on
+                        self._log.write(f"{self._prefix}{line.rstrip()}\n")
+                        self._log.flush()
 
     def _reap(self, wait: Callable[[], int]) -> None:
         self._code = wait()

@@ -235,7 +235,8 @@ class Runner:
 
     def _say(self, text: str) -> None:
         if self._log is not None:
-            print(f"[runner] {text}", file=self._log, flush=True)
+            with suppress(OSError):  # its reader has gone; the graph goes on
+                print(f"[runner] {text}", file=self._log, flush=True)
 
 
 def clean_shared_memory() -> None:
@@ -320,7 +321,8 @@ def run(graph: Graph, run_dir: Path, python: str = sys.executable, ready_s: floa
 
 
 def _print(text: str) -> None:
-    print(f"[runner] {text}", flush=True)
+    with suppress(OSError):  # as in Runner._say
+        print(f"[runner] {text}", flush=True)
 
 
 def _raise(runner: Runner, received: Sequence[int]) -> None:

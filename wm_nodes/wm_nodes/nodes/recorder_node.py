@@ -54,6 +54,9 @@ class RecorderNode(ManagedNode):
         self._bag: RawBagWriter | None = None
         self._paused = False
         self._latched: dict[str, bytes] = {}
+        """The newest message of each latched topic."""
+        self._unwritten: dict[str, bytes] = {}
+        """Those of them that came during a pause."""
         self._versions: set[int] = set()
         self._time_ns = 0
         self._last_message_s = 0.0
@@ -114,6 +117,8 @@ class RecorderNode(ManagedNode):
                 self.diagnostics.count(f"gaps {name}", missing, text=f"{missing} messages of {name} missed")
         if self._rows[name].qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
             self._latched[name] = data
+            if self._paused:
+                self._unwritten[name] = data
         if not self._paused:
             self._write(name, data)
         if credits is not None and tracker is not None:
@@ -133,35 +138,56 @@ class RecorderNode(ManagedNode):
         if self._bag is None:
             return
         began = time.perf_counter()
-        self._time_ns = max(self._time_ns + 1, time.time_ns())
-        if _base(name) == topics.POLICY_VERSION.name:
-            self._versions.add(int(m.deserialize(data, topics.POLICY_VERSION.msgtype).version))
         try:
-            self._bag.write(self._names[name], data, self._time_ns)
+            self._append(self._bag, name, data)
         except RecordingError as error:
             self._fail(error)
         self.diagnostics.latency("write", time.perf_counter() - began)
 
+    def _append(self, bag: RawBagWriter, name: str, data: bytes) -> None:
+        """Raises RecordingError where the disk refuses it."""
+        self._time_ns = max(self._time_ns + 1, time.time_ns())
+        if _base(name) == topics.POLICY_VERSION.name:
+            self._versions.add(int(m.deserialize(data, topics.POLICY_VERSION.msgtype).version))
+        bag.write(self._names[name], data, self._time_ns)
+
     def _start(self, uri: str) -> Path:
-        """Open a bag and write into it the latched messages (spec, goal, policy) that still hold."""
+        """Open a bag and write into it the latched messages (spec, goal, policy) that still hold.
+
+        Raises:
+            BagError: one is open, or the name is taken.
+            RecordingError: the disk refuses it.
+        """
         if self._bag is not None:
             raise BagError(f"already recording to {self._bag.path}; call recorder/stop first")
         path = self.run_dir / uri if uri else self._next_path()
         self._check_free(path.parent)
-        self._bag = RawBagWriter(
+        bag = self._bag = RawBagWriter(
             path, custom={"wm.run_id": self.run_dir.name}, split_bytes=int(self.param("split_mib")) * MIB,
             split_s=float(self.param("split_s")),
         )
         self._paused, self._time_ns, self._versions = False, 0, set()
         for tracker in self._gaps.values():  # they stay: what was granted must not be taken back
             tracker.clear_losses()
+        self._unwritten.clear()
         for name, row in self._rows.items():
-            self._bag.add_topic(self._names[name], _msgtype(row), [recorded_qos(row.qos)])
-        for name, data in self._latched.items():
-            self._write(name, data)
+            bag.add_topic(self._names[name], _msgtype(row), [recorded_qos(row.qos)])
+        try:
+            for name, data in self._latched.items():
+                self._append(bag, name, data)
+        except RecordingError as error:
+            self._fail(error)
+            raise
         self.diagnostics.clear_condition("recording")
         self.get_logger().info(f"recording to {path}")
         return path
+
+    def _resume(self, bag: RawBagWriter) -> None:
+        """Go on, first with the latched messages that came during the pause. Raises RecordingError."""
+        self._paused = False
+        while self._unwritten:
+            name = next(iter(self._unwritten))
+            self._append(bag, name, self._unwritten.pop(name))
 
     def _stop(self) -> tuple[Path, int, int] | None:
         """Complete the bag; return its path, messages and losses, or None while not recording."""
@@ -209,12 +235,17 @@ class RecorderNode(ManagedNode):
         return folder / f"bag_{number:03d}"
 
     def _note_in_index(self, path: Path, messages: int, lost: int) -> None:
-        """run_dir/bags.json lists every completed bag of the run."""
+        """run_dir/bags.json lists every completed bag of the run; where that fails, the bag is as good as before."""
         index = self.run_dir / "bags.json"
-        rows = json.loads(index.read_text(encoding="utf-8")) if index.is_file() else []
         uri = str(path.relative_to(self.run_dir)) if path.is_relative_to(self.run_dir) else str(path)
-        rows.append({"bag": uri, "messages": messages, "lost": lost})
-        write_atomic(index, json.dumps(rows, indent=1).encode())
+        row = {"bag": uri, "messages": messages, "lost": lost}
+        try:
+            rows = json.loads(index.read_text(encoding="utf-8")) if index.is_file() else []
+            write_atomic(index, json.dumps([*rows, row], indent=1).encode())
+        except (OSError, TypeError, ValueError) as error:
+            text = f"bag {path} is complete, but {index} does not list it: {error}"
+            self.get_logger().error(text)
+            self.diagnostics.count("unlisted_bags", level=diagnostics.ERROR, text=text)
 
     def _on_timer(self) -> None:
         if self._bag is None:
@@ -222,7 +253,7 @@ class RecorderNode(ManagedNode):
         try:
             self._bag.flush()
             self._check_free(self._bag.partial_path)
-        except RecordingError as error:
+        except OSError as error:
             self._fail(error)
 
     def _check_free(self, folder: Path) -> None:
@@ -231,13 +262,14 @@ class RecorderNode(ManagedNode):
         if free < least:
             raise RecordingError(f"only {free} MiB free in {existing}, less than min_free_mib={least}; free some space")
 
-    def _fail(self, error: RecordingError) -> None:
+    def _fail(self, error: OSError) -> None:
         """Stop recording with one error; the bag is completed where the disk still allows it."""
+        partial = self._bag.partial_path if self._bag is not None else None
         try:
             stopped = self._stop()
         except (BagError, RecordingError):
-            stopped, self._bag = None, None
-        state = f"bag {stopped[0]} is complete up to here" if stopped else "the bag is unfinished"
+            stopped = None
+        state = f"bag {stopped[0]} is complete up to here" if stopped else f"the bag is unfinished: {partial}"
         text = f"recording stopped: {error}; {state}"
         self.get_logger().error(text)
         self.diagnostics.set_condition("recording", diagnostics.ERROR, text)
@@ -274,8 +306,10 @@ class RecorderNode(ManagedNode):
         try:
             if name == "split":
                 self._bag.split()
+            elif name == "pause":
+                self._paused = True
             else:
-                self._paused = name == "pause"
+                self._resume(self._bag)
             response.success = True
         except RecordingError as error:
             self._fail(error)

@@ -143,8 +143,7 @@ class RewardEvaluatorNode(ManagedNode):
         """Judge, in order, the lock-steps whose images and goals are there or are overdue."""
         for step in self._joiner.take(patience_s=float(self.param("image_wait_s"))):
             if isinstance(self._model, EpisodeReward):
-                assert self._spec is not None  # transitions wait for it
-                self._undecided.append((time.perf_counter(), step, self._model.add(step, self._spec)))
+                self._undecided.append((time.perf_counter(), step, self._collect(self._model, step)))
                 self._publish_decided()
             else:
                 began = time.perf_counter()
@@ -157,11 +156,22 @@ class RewardEvaluatorNode(ManagedNode):
         self._judge_joined()
         self._publish_decided()
 
+    def _collect(self, model: EpisodeReward, step: LockStep) -> PendingReward:
+        """Add the step to its episodes; where that fails, it has no rewards."""
+        assert self._spec is not None  # transitions wait for it
+        try:
+            return model.add(step, self._spec)
+        except Exception as error:
+            return PendingReward(step.valid, {int(n): _text(error) for n in np.flatnonzero(step.valid)})
+
     def _publish_decided(self) -> None:
         while self._agent is not None and self._undecided and self._undecided[0][2].done:
             since, step, pending = self._undecided.popleft()
             for env, verdict in pending.verdicts().items():
                 self._agent.publish(verdict, clip=env, iteration=step.step_id, stamp_ns=step.stamp_ns)
+            for env, problem in pending.problems().items():
+                text = f"step {step.step_id} of environment {env} has no verdict: {problem}"
+                self.get_logger().error(text, throttle_duration_sec=1.0)
             self._publish(step, pending.result(), time.perf_counter() - since)
 
     def _drop_undecided(self) -> None:
@@ -180,10 +190,12 @@ class RewardEvaluatorNode(ManagedNode):
             missing = step.stamp_ns if step.images is None else step.next_stamp_ns
             return _unjudged(step, f"no image with stamp {missing} ns")
         try:
-            return model.evaluate(reward_input(step.images, step.next_images, step, step.goals))
-        except (ValueError, RuntimeError) as error:
-            self.get_logger().error(f"reward of step {step.step_id} failed: {error}")
-            return _unjudged(step, f"{type(error).__name__}: {error}")
+            result = model.evaluate(reward_input(step.images, step.next_images, step, step.goals))
+            _check_rewards(result, len(step.valid))
+            return result
+        except Exception as error:  # of a reward model that may be anybody's
+            self.get_logger().error(f"reward of step {step.step_id} failed: {_text(error)}", throttle_duration_sec=1.0)
+            return _unjudged(step, _text(error))
 
     def _publish(self, step: LockStep, result: RewardResult, eval_s: float) -> None:
         self._rewards.publish(
@@ -222,6 +234,21 @@ class RewardEvaluatorNode(ManagedNode):
             step, result, name=self._model.name, version=self._model.version, eval_s=time.perf_counter() - began
         )
         return response
+
+
+def _check_rewards(result: RewardResult, num_envs: int) -> None:
+    """Raises ValueError: arrays of another shape, or a valid reward that is no number."""
+    names = ("total", "dense", "sparse", "valid", "success")
+    arrays = {**{name: getattr(result, name) for name in names}, **result.components}
+    for name, array in arrays.items():
+        if np.shape(array) != (num_envs,):
+            raise ValueError(f"{name} of the rewards is of shape {np.shape(array)}, not ({num_envs},)")
+    if not np.isfinite(result.total[result.valid]).all():
+        raise ValueError("total of a valid reward is NaN or infinite")
+
+
+def _text(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
 
 
 def _unjudged(step: LockStep, reason: str) -> RewardResult:

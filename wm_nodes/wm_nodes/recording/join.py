@@ -24,7 +24,8 @@ from wm_nodes.recording.errors import BagError
 from wm_nodes.recording.messages import KIND_END, goals_of, images_of, lockstep_of, rewards_of, stamp_ns
 
 MAX_LAG = 64
-"""Recorded lock-steps that may pass before an image or reward counts as missing."""
+"""Recorded lock-steps that may pass before an image counts as missing, or the rewards from before a reset, or rewards
+of which later ones have come."""
 
 KEPT = 64
 """Images and rewards, and goals of each environment, that are kept for a lock-step that comes after them: topics are
@@ -51,6 +52,11 @@ class Joiner:
         self._rewards: dict[StepKey, Rewards] = {}
         self._goals: dict[tuple[int, int], tuple[UInt8Array | None, bool]] = {}
         self._waiting: deque[tuple[float, LockStep]] = deque()
+        self._num_put = 0
+        self._resets: deque[int] = deque()
+        """How many lock-steps had been put before each reset, or restart, that comes after the oldest that waits."""
+        self._newest_rewards: tuple[int, int] | None = None
+        """Session and step id."""
 
     def clear(self) -> None:
         """Forget everything."""
@@ -58,6 +64,8 @@ class Joiner:
         self._rewards.clear()
         self._goals.clear()
         self._waiting.clear()
+        self._resets.clear()
+        self._newest_rewards = None
         self._goals_come = self._with_goals
 
     def put_image(self, stamp_ns: int, images: UInt8Array) -> None:
@@ -66,27 +74,44 @@ class Joiner:
 
     def put_rewards(self, rewards: Rewards) -> None:
         self._rewards.setdefault(rewards.key, rewards)
+        self._newest_rewards = rewards.session, rewards.step_id
         self._bound(self._rewards)
+
+    def end_rewards(self) -> None:
+        """No more will come: nothing waits for them any longer."""
+        self._with_rewards = False
 
     def put_goals(self, goals: Goals) -> None:
         for n, episode_id in enumerate(goals.episode_ids):
             key = goals.session, int(episode_id)
             self._goals.pop(key, None)  # the newest last
             self._goals[key] = None if goals.images is None else goals.images[n], bool(goals.found[n])
-        while len(self._goals) > KEPT * len(goals.episode_ids):
+        while len(self._goals) > (KEPT + len(self._waiting)) * len(goals.episode_ids):
             del self._goals[next(iter(self._goals))]
 
     def put_step(self, step: LockStep) -> None:
         """The next lock-step to be taken."""
+        if self._waiting and (step.is_reset or step.session != self._waiting[-1][1].session):
+            self._resets.append(self._num_put)
         self._waiting.append((time.monotonic(), step))
+        self._num_put += 1
 
     def take(self, *, patience_s: float = math.inf, max_behind: int = sys.maxsize) -> Iterator[LockStep]:
-        """Take out, in order, the lock-steps that are complete, and those that waited for patience_s or have more than
-        max_behind behind them, with what they have. Goals that nobody publishes are waited for once."""
+        """Take out, in order, the lock-steps that are complete, and those that are too late, with what they have: they
+        waited for patience_s, or max_behind is exceeded. Goals that nobody publishes are waited for once.
+
+        A reward agent judges episodes, while whole rollouts come before its first verdict. Rewards, which are published
+        in the order of the lock-steps, are therefore waited for until later ones have come, or until the next reset:
+        what waits is no more than a rollout and max_behind, or what comes before the next or the last rewards.
+
+        Args:
+            max_behind: lock-steps that may wait behind one that lacks an image or a goal, or rewards of which later
+                ones have come; and from the next reset on, behind one that lacks rewards.
+        """
         while self._waiting:
             since, step = self._waiting[0]
             if not self.is_complete(step):
-                if len(self._waiting) <= max_behind and time.monotonic() - since < patience_s:
+                if not self._is_late(step, max_behind) and time.monotonic() - since < patience_s:
                     return
                 if not self._goals and self._has_images(step):
                     self._goals_come = False
@@ -96,12 +121,7 @@ class Joiner:
             yield joined
 
     def is_complete(self, step: LockStep) -> bool:
-        if not self._has_images(step):
-            return False
-        if self._with_rewards and step.valid.any() and step.key not in self._rewards:
-            return False
-        episodes = step.episode_ids[step.valid] if self._goals_come else ()
-        return all((step.session, int(episode_id)) in self._goals for episode_id in episodes)
+        return self._has_images(step) and self._has_rewards(step) and self._has_goals(step)
 
     def joined(self, step: LockStep) -> LockStep:
         """The lock-step with what has come for it."""
@@ -124,6 +144,34 @@ class Joiner:
 
     def _has_images(self, step: LockStep) -> bool:
         return step.stamp_ns in self._images and step.next_stamp_ns in self._images
+
+    def _has_rewards(self, step: LockStep) -> bool:
+        """Or needs none."""
+        return not self._with_rewards or not step.valid.any() or step.key in self._rewards
+
+    def _has_goals(self, step: LockStep) -> bool:
+        """Or needs none."""
+        episodes = step.episode_ids[step.valid] if self._goals_come else ()
+        return all((step.session, int(episode_id)) in self._goals for episode_id in episodes)
+
+    def _is_late(self, step: LockStep, max_behind: int) -> bool:
+        """Whether nothing that the oldest lock-step lacks is waited for any longer."""
+        is_long = len(self._waiting) > max_behind
+        if not is_long and not (self._has_images(step) and self._has_goals(step)):
+            return False
+        return self._has_rewards(step) or self._since_reset() > max_behind or (is_long and self._is_passed_over(step))
+
+    def _since_reset(self) -> int:
+        """Lock-steps from the first reset after the oldest one on; 0 while none has come."""
+        oldest = self._num_put - len(self._waiting)
+        while self._resets and self._resets[0] <= oldest:
+            self._resets.popleft()
+        return self._num_put - self._resets[0] if self._resets else 0
+
+    def _is_passed_over(self, step: LockStep) -> bool:
+        """Whether rewards of a later lock-step of its session have come."""
+        newest = self._newest_rewards
+        return newest is not None and newest[0] == step.session and newest[1] > step.step_id
 
     def _goals_of(self, step: LockStep) -> tuple[UInt8Array, BoolArray] | None:
         goals = [self._goals.get((step.session, int(episode_id)), (None, False)) for episode_id in step.episode_ids]
@@ -161,6 +209,7 @@ class LockSteps:
                 "record that topic to train from the bag"
             )
         self._joiner = Joiner(with_rewards=self._counts[topics.REWARD] > 0)
+        self._rewards_to_come = self._counts[topics.REWARD]
         self._last_seq: tuple[int, int] | None = None
 
     @property
@@ -198,6 +247,9 @@ class LockSteps:
     def _put_reward(self, message: Any) -> None:
         if self._reward_name in (None, message.reward_name):
             self._joiner.put_rewards(rewards_of(message))
+        self._rewards_to_come -= 1
+        if not self._rewards_to_come:
+            self._joiner.end_rewards()
 
     def _put_goals(self, message: Any) -> None:
         if len(message.goal_image.data):

@@ -57,6 +57,7 @@ class RawBagWriter:
         self._split_bytes, self._split_s = split_bytes, split_s
         self._writer: Writer | None = None
         self._stream: BufferedWriter | None = None
+        self._aborted = False
         self._file_started = self._last_flush = time.monotonic()
         self._unflushed = 0
         try:
@@ -157,10 +158,20 @@ class RawBagWriter:
         if not self.files[-1].messages:
             return
         self._finish_file()
-        self._open_file()
+        try:
+            self._open_file()
+        except OSError as error:
+            raise self._abort_with(error) from error
 
     def close(self) -> Path:
-        """Complete the bag, write metadata.yaml and rename the folder to its final name, which is returned."""
+        """Complete the bag, write metadata.yaml and rename the folder to its final name, which is returned.
+
+        Raises:
+            RecordingError: the disk refuses it now, or refused a write before, or abort() was called: the bag is
+                unfinished, and there is only the partial folder.
+        """
+        if self._aborted:
+            raise RecordingError(f"bag {self.path} is unfinished: what was written of it is in {self.partial_path}")
         if self._writer is None:
             return self.path
         self._finish_file()
@@ -178,6 +189,7 @@ class RawBagWriter:
 
     def abort(self, *, remove: bool = False) -> None:
         """Stop without completing the bag; it stays in the partial folder for recovery unless `remove`."""
+        self._aborted = True
         stream, self._stream, self._writer = self._stream, None, None
         if stream is not None:
             try:

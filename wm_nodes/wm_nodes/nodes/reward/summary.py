@@ -26,7 +26,8 @@ class SummaryWindow:
     def add(self, step: LockStep, result: RewardResult) -> None:
         """Count one judged lock-step."""
         self.invalid += int((step.valid & ~result.valid).sum())
-        self._rewards.append(np.stack([result.total, result.dense, result.sparse])[:, result.valid])
+        if result.valid.any():
+            self._rewards.append(np.stack([result.total, result.dense, result.sparse])[:, result.valid])
         for i in np.flatnonzero(result.valid):
             self._returns[int(step.episode_ids[i])] += float(result.total[i])
         while len(self._returns) > EPISODES_KEPT:
@@ -36,10 +37,12 @@ class SummaryWindow:
             self._ended.append((gained, int(step.episode_steps[i]) + 1, bool(step.terminated[i])))
 
     def take(self) -> dict[str, float | int] | None:
-        """Return the fields of RewardSummary and start again; None when nothing was judged."""
-        total, dense, sparse = np.concatenate([np.empty((3, 0), np.float32), *self._rewards], 1)
-        if not total.size:
+        """Return the fields of RewardSummary and start again; None when no step was made. Means, minimum and maximum
+        are NaN where not one of the steps has a reward."""
+        rewards = np.concatenate([np.empty((3, 0), np.float32), *self._rewards], 1)
+        if not rewards.size and not self.invalid:
             return None
+        total, dense, sparse = rewards if rewards.size else np.full((3, 1), np.nan, np.float32)
         returns, lengths, successes = zip(*self._ended, strict=True) if self._ended else ((math.nan,),) * 3
         values: dict[str, float | int] = {
             "mean_total": float(total.mean()), "mean_dense": float(dense.mean()), "mean_sparse": float(sparse.mean()),
