@@ -271,6 +271,12 @@ def test_a_start_goes_on_where_its_model_was_moved_and_not_with_another_reader(t
     moved = with_reader(config, new)
     assert [path.read_bytes() for path in prepare_start(moved, run, new)] == made
     keep_plan(acceptance_plan(moved), tmp_path)
+    demos, other = run / "bags" / "demos", tmp_path / "demos"
+    of_bags = moved.with_values(sft=moved.sft.with_values(bags=[*map(str, sorted(demos.glob("shard_*")))]))
+    begun = prepare_start(of_bags, tmp_path / "own", new)
+    demos.rename(other)
+    of_bags = moved.with_values(sft=moved.sft.with_values(bags=[*map(str, sorted(other.glob("shard_*")))]))
+    assert prepare_start(of_bags, tmp_path / "own", new) == begun
     (new / READER).write_bytes(b"another one")
     with pytest.raises(ValueError, match=r"were made with simulation\.object_state sha256 .*; take another folder"):
         prepare_start(moved, run, new)

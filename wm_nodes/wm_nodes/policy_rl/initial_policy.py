@@ -33,6 +33,7 @@ from wm_nodes.policy_rl.behaviour_cloning import EXPERT, demonstrations, train_s
 from wm_nodes.policy_rl.factories import STARTS, make_policy, make_reconstruct, policy_actor, run_spec
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.recording import BagReport, read_episodes
+from wm_nodes.training.contents import content_of
 from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.starts import INSTRUCTIONS, join_starts, pack_instructions
@@ -158,6 +159,7 @@ def _keep_settings(config: RunConfig, run_dir: Path, model_dir: Path) -> None:
         "data": {"start_frames", "behaviours"} if config.data.start_frames == "any" else {"start_frames"},
     })
     made_of["simulation"] = as_compared(config.simulation)
+    made_of["sft"]["bags"] = [content_of(bag) or bag for bag in config.sft.bags]  # they may be moved
     now = {
         f"{section}.{name}": value for section, values in made_of.items() if isinstance(values, dict)
         for name, value in values.items()
