@@ -72,7 +72,7 @@ def test_the_control_is_trained_and_measured_in_the_simulator(work: Workplace) -
     row, ppo = train_in(work, SIMULATOR), work.config.ppo
     assert (row["model"], row["updates"], len(row["course"])) == ("simulator", ppo.updates, ppo.updates)
     assert row["real_before"]["episodes"] == row["real_after"]["episodes"] == work.config.evaluation.episodes
-    assert row["imagined_after"]["episodes"] == 8 * work.config.evaluation.episodes
+    assert row["imagined_after"]["episodes"] == 5  # as many as there are starts
     (trained,) = (Path(path) for path in row["policies"])
     assert trained.parent.name == "simulator" and file_sha256(trained) != file_sha256(work.start[1])
 
