@@ -12,12 +12,13 @@ from wm_nodes.config.environments import TRUTH, SimulationConfig
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT, STARTS, SeedRange, demonstration_seeds
 from wm_nodes.config.tasks import get_task, model_tasks, recorded_task
-from wm_nodes.core.files import file_sha256, write_atomic
+from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import Episode
 from wm_nodes.environments import collection
 from wm_nodes.environments.collection import CollectionPlan, PolicyAct, collect
 from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.recording import Bag, EpisodeBagWriter
+from wm_nodes.training.contents import content_of
 
 INDEX, PLAN = "index.csv", "plan.json"
 FROM_TABLE = ("task", "seed", "behaviour", "instruction")
@@ -109,8 +110,8 @@ def collect_plan(plan: CollectionPlan, config: RunConfig, folder: Path) -> list[
 def as_compared(simulation: SimulationConfig) -> dict[str, Any]:
     """The settings that recordings follow from, a reader by its content: its folder may be moved, or copied."""
     values = simulation.model_dump(mode="json", exclude={"render_device"})
-    if simulation.object_state != TRUTH and (reader := Path(simulation.object_state)).is_file():
-        values["object_state"] = f"sha256 {file_sha256(reader)}"
+    if simulation.object_state not in ("", TRUTH) and (content := content_of(simulation.object_state)):
+        values["object_state"] = f"sha256 {content}"
     return values
 
 

@@ -26,7 +26,8 @@ from wm_nodes.nodes.environment.asynchronous import AsynchronousEnvironment
 from wm_nodes.nodes.environment.camera_topics import CameraTopics
 from wm_nodes.nodes.environment.image_views import PARAMS as VIEW_PARAMS
 from wm_nodes.nodes.environment.image_views import ImageViews
-from wm_nodes.nodes.environment.lockstep import LockstepEnvironment, StampClock
+from wm_nodes.nodes.environment.lockstep import LockstepEnvironment
+from wm_nodes.nodes.environment.stamp_clock import StampClock
 from wm_nodes.nodes.factories import BACKENDS, make_environment
 from wm_nodes.recording.messages import tiles_of
 from wm_nodes.ros import calls, convert, diagnostics

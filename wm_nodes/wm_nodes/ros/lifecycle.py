@@ -29,7 +29,7 @@ from wm_nodes.ros.guard import Guard
 from wm_nodes.ros.liveliness import HEARTBEAT_S, Heartbeat, PeerWatch
 from wm_nodes.ros.params import COMMON, Param, declare, refusal
 from wm_nodes.ros.publishing import StampedPublisher
-from wm_nodes.ros.qos import ANY_PUBLISHER, topic
+from wm_nodes.ros.qos import VIEW, topic
 from wm_nodes.ros.sequence_numbers import GapTracker, new_session
 
 T = TypeVar("T")
@@ -209,7 +209,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         latched reader does not match. The callback may get a message twice; received and dropped are counted under the
         topic's relative and its absolute name."""
         row, quiet = topic("safety/estop"), SubscriptionEventCallbacks(use_default_callbacks=False)
-        for name, qos in ((row.name, row.reader_qos), (self.resolve_topic_name(row.name), ANY_PUBLISHER)):
+        for name, qos in ((row.name, row.reader_qos), (self.resolve_topic_name(row.name), VIEW)):
             subscription = self.create_subscription(row.type, name, callback, qos, event_callbacks=quiet)
             self.own(self.destroy_subscription, subscription)
 

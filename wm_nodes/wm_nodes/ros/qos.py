@@ -85,10 +85,7 @@ LATCHED = profile_of(recorded.LATCHED)
 METRICS = profile_of(recorded.METRICS)
 
 VIEW = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=1)
-"""For viewers: never holds anything back."""
-
-ANY_PUBLISHER = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=1)
-"""For a reader that no publisher's QoS keeps out; it misses what was latched before."""
+"""For viewers: never holds anything back, and as a reader no publisher's QoS keeps it out."""
 
 PICTURE = QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=2)
 """For viewers that ask for reliable images, as RViz does unless told otherwise; it holds nothing back either."""

@@ -1,12 +1,12 @@
 """What the files and folders hold that a run names by their paths, so that they can be moved between two starts."""
 
-import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from wm_nodes.core.files import file_sha256
 from wm_nodes.core.model_folder import MANIFEST
 
 NAMED_BY = (MANIFEST, "metadata.yaml")
@@ -47,8 +47,7 @@ def content_of(path: str) -> str:
     for file in (Path(path), *(Path(path, name) for name in NAMED_BY)):
         with suppress(OSError):
             if file.is_file():  # not a robot's port, which could be waited for without end
-                with file.open("rb") as stream:
-                    return hashlib.file_digest(stream, "sha256").hexdigest()
+                return file_sha256(file)
     return ""
 
 

@@ -16,7 +16,8 @@ from wm_nodes.core.errors import WireError
 from wm_nodes.core.lockstep import Goals, LockStep
 from wm_nodes.core.types import FloatArray, Observation, StepResult, UInt8Array
 from wm_nodes.nodes.environment.asynchronous import AsynchronousEnvironment
-from wm_nodes.nodes.environment.lockstep import LockstepEnvironment, StampClock
+from wm_nodes.nodes.environment.lockstep import LockstepEnvironment
+from wm_nodes.nodes.environment.stamp_clock import StampClock
 from wm_nodes.ros.clients import LocalEnvironmentClient
 from wm_nodes.ros.wire import EpisodeNote, PeerLost, ResetCommand, StepCommand
 

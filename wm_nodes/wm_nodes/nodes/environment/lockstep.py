@@ -1,8 +1,6 @@
 """The rules of a lock-step environment: step ids, safe retry, gates, stamps, episodes. No rclpy: numpy in, numpy out.
 
 Shapes: N environments, A action, S state, P ground truth.
-
-A stamp is the wall time at which an observation was made. Nothing that is computed depends on it.
 """
 
 import threading
@@ -22,26 +20,13 @@ from wm_nodes.core.specs import SOURCE_IMAGINED, SOURCE_REAL, EnvironmentSpec
 from wm_nodes.core.tool_control import hold_actions
 from wm_nodes.core.types import BoolArray, Environment, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 from wm_nodes.nodes.environment.running_episodes import RunningEpisodes
+from wm_nodes.nodes.environment.stamp_clock import StampClock
 from wm_nodes.ros.wire import EpisodeNote, Reply, ResetCommand, StepCommand
 
 UNIT_TOLERANCE = 1e-6
 
 REPEAT_S = 1.0
 """A reset that was sent again while the first one was made waits for its end, and is taken at most so long after it."""
-
-
-class StampClock:
-    """Gives the stamps of one node's observations: wall time, and always later than the stamp before.
-
-    now_ns: ns since the epoch; it may stand still or jump back.
-    """
-
-    def __init__(self, now_ns: Callable[[], int] = time.time_ns) -> None:
-        self._now_ns, self._last_ns = now_ns, 0
-
-    def __call__(self) -> int:
-        self._last_ns = max(self._now_ns(), self._last_ns + 1)
-        return self._last_ns
 
 
 class Sink(Protocol):
