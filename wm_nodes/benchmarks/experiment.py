@@ -27,7 +27,7 @@ EXPERIMENTS = {
     "view": "speed.view:View",
     "trained-in": "environments.experiments:TrainedIn", "ranking": "environments.experiments:Ranking",
     "policy": "environments.experiments:Measured", "roboscape": "environments.roboscape:RoboScape",
-    "clones": "environments.clones:Clones",
+    "clones": "environments.clones:Clones", "replays": "environments.replays:Replays",
     "openvla-size": "environments.openvla_size:OpenVlaSize",
     "disc-base": "video_rl.discs:DiscBase", "diversity": "video_rl.diversity:DiscDiversity",
     "learning": "video_rl.discs:Learning", "ablations": "video_rl.discs:Ablations",

@@ -125,23 +125,17 @@ class RoboScape(Configured):
         shown = list[dict[str, Any]]()
         cells = [(task, seed, name) for task in self.columns for seed in self.seeds for name in trainings]
         for task, seed, training in tqdm(cells, desc="cells", unit="cell"):
-            own = scene_of_seed(seed)
-            place = self.workplace(task, seed, own, training)
+            place, own = workplace(self, self.work, task, seed, training)
             wanted = {**place.identity(SIMULATOR, (own, *OOD)), "model": training, "task": task, "seed": seed}
             shown += self.once(wanted, partial(_cell, place, training, own, self.learned_from, self.work))
         self._show(shown, trainings)
         if self.figure == "4":
             self._draw(shown)
 
-    def workplace(self, task: str, seed: int, own: str, training: str) -> Workplace:
-        dense = {"reward.dense_weight": 1.0, "reward.mode": DENSE[training]} if training in DENSE else {}
-        config = load_config(self.preset, {"sft.scenes": own, **dense, **self.settings, "task": task, "seed": seed})
-        return Workplace(config, self.model_dir or shipped_model(task), self.work.absolute() / f"{task}_{seed}")
-
     def _draw(self, rows: Sequence[dict[str, Any]]) -> None:
         for task, seed in dict.fromkeys((row["task"], row["seed"]) for row in rows):
             of = [row for row in rows if (row["task"], row["seed"]) == (task, seed)]
-            place = self.workplace(task, seed, of[0]["scene"], SFT)
+            place, _ = workplace(self, self.work, task, seed, SFT)
             weights = {LABELS[row["model"]]: Path(row["weights"]) for row in of}
             for path in draw_policies(place, weights, (of[0]["scene"], *OOD), place.folder):
                 console.print(f"film strip: {path}")
@@ -181,37 +175,46 @@ class RoboScape(Configured):
                 console.print(f"OOD, {LABELS[MODEL]} less {LABELS[base]}, mean over tasks: {text} points")
 
 
+def workplace(of: Configured, work: Path, task: str, seed: int, training: str) -> tuple[Workplace, str]:
+    """Where one policy is made, below `work`, by the settings of an experiment; and the scene of its clone."""
+    own, dense = scene_of_seed(seed), dict[str, Any]()
+    if training in DENSE:
+        dense = {"reward.dense_weight": 1.0, "reward.mode": DENSE[training]}
+    config = load_config(of.preset, {"sft.scenes": own, **dense, **of.settings, "task": task, "seed": seed})
+    return Workplace(config, of.model_dir or shipped_model(task), work.absolute() / f"{task}_{seed}"), own
+
+
 def _cell(
-    workplace: Workplace, training: str, own: str, learned_from: int, work: Path
+    place: Workplace, training: str, own: str, learned_from: int, work: Path
 ) -> Iterator[dict[str, Any]]:
     """Train one policy and measure it in every column; one row."""
-    config, policy, report, refresh = workplace.config, workplace.policy(), None, None
+    config, policy, report, refresh = place.config, place.policy(), None, None
     imagined: ImaginedEpisodes | None = None
     if training == REFRESHED:
-        workplace, refresh = _refreshed(workplace)
+        place, refresh = _refreshed(place)
     if training in IN_MODEL:
-        imagined = workplace.environment(WORLD_MODEL)
-        before = workplace.imagined(policy, imagined)
-        report = workplace.acceptance(WORLD_MODEL, policy, before, workplace.real(policy, TRAIN))
+        imagined = place.environment(WORLD_MODEL)
+        before = place.imagined(policy, imagined)
+        report = place.acceptance(WORLD_MODEL, policy, before, place.real(policy, TRAIN))
         assert isinstance(imagined, ImaginedEnvironment)
         imagined.picture_noise = config.imagined_environment.picture_noise  # while it is trained in
     if training in LEARNED:
-        imagined = environment_paid_by(LEARNED[training], workplace, learned_from, work)
+        imagined = environment_paid_by(LEARNED[training], place, learned_from, work)
     course = list[float]()
     if training != SFT:
         words = f"{config.task}, seed {config.seed}, {LABELS[training]}"
         with tqdm(total=config.ppo.updates, desc=words, unit="update") as bar:
             updates = (
-                train_by_verdicts(workplace, policy, imagined) if imagined and training == JUDGE
-                else train_on(workplace, policy, imagined, own if training == ONE_SCENE else TRAIN)
+                train_by_verdicts(place, policy, imagined) if imagined and training == JUDGE
+                else train_on(place, policy, imagined, own if training == ONE_SCENE else TRAIN)
             )
             for success_rate in updates:
                 course.append(success_rate)
                 bar.update()
     settings = sha256(config.model_dump_json().encode()).hexdigest()
-    weights = workplace.folder / f"{training}_{settings[:8]}.safetensors"
+    weights = place.folder / f"{training}_{settings[:8]}.safetensors"
     save_weights(policy, weights, {"tokenizer_sha256": policy.encoder.sha256})
-    found = {name: workplace.real(policy, name) for name in (own, *OOD)}
+    found = {name: place.real(policy, name) for name in (own, *OOD)}
     yield {
         "scene": own, "course": course, "weights": str(weights),
         **({} if report is None else {"accepted": report.passed, "acceptance": report.to_dict()}),

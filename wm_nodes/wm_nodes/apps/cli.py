@@ -70,6 +70,7 @@ GROUPS = {
         "benchmark policy": "success of a policy in an environment of your own, and what that measures beside it",
         "reproduce roboscape": "Tables 1 and 2, Figures 2, 3, 4 and 9 of RoboScape-R at this size, with every control",
         "benchmark clones": "success of cloned policies by what they see and by the number of demonstrations",
+        "benchmark replays": "how many of a policy's imagined successes are real, in scenes of every split",
         "benchmark disc-base": "the video model that experiments on the moving disc begin with",
         "benchmark diversity": "diversity on the moving disc, at equal quality and noise budget",
         "benchmark learning": "reward against model calls, every sampler on one learner",

@@ -67,6 +67,13 @@ def _roll_out(
         return None
     starts = folder / STARTS
     write_starts(bags, starts, config.acceptance.clone_episodes)
+    return roll_out(config, model_dir, policy, starts, video_model_dir)
+
+
+def roll_out(
+    config: RunConfig, model_dir: Path, policy: ImagePolicy, starts: Path, video_model_dir: Path | None = None
+) -> CloneRollouts:
+    """Play a policy in the model from every start of a file, and its actions again in the simulator."""
     make = make_imagined_environment if video_model_dir is None else make_video_environment
     seeds = load_start_seeds(starts, config.task)
     num_envs = min(len(seeds), IMAGINED_ENVS)
