@@ -68,7 +68,7 @@ def table_1() -> Rows:
                 task, f"{inputs}, {_shown_to(of[0])}", LABELS[training],
                 *(f"{fmean(success_of(row, domain) for row in of):.1f}" for domain in DOMAINS),
                 *(", ".join(f"{success_of(row, domain):.1f}" for row in of) for domain in DOMAINS),
-                ", ".join("yes" if row["accepted"] else "no" for row in of) if "accepted" in of[0] else "",
+                ", ".join(row["acceptance"]["outcome"] for row in of) if "acceptance" in of[0] else "",
                 *("" if paper is None else paper[TASKS.index(task)] for paper in papers),
             )
 
