@@ -1,6 +1,7 @@
 """Plain bags become ours: what is seen at a tick, what is commanded until the next, where episodes begin and end."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -267,6 +268,36 @@ def test_a_reward_is_recorded_and_says_where_success_begins(tmp_path: Path) -> N
     (episode,) = one_topic(tmp_path, stream(6) + pays, episodes__success=rule)
     assert episode.success.tolist() == [False, False, False, True, True, True]
     np.testing.assert_allclose(episode.rewards, [0.25, 0.5, 0.75, 1.0, 1.25])
+
+
+def with_success(values: list[float], kind: str, done: float) -> Callable[[list[Message]], list[Message]]:
+    """Run's messages, with success said from each episode's start on every 100 ms, in place of the verdict after it."""
+    def change(messages: list[Message]) -> list[Message]:
+        begins = [time_ns for time_ns, topic, one in messages if topic == "/episode" and one.data]
+        return [each for each in messages if each[1] != "/success"] + [
+            (begin_ns + tick * 100 * MS, "/success", message(kind, data=type(done)(value)))
+            for begin_ns in begins for tick, value in enumerate(values)
+        ]
+
+    return change
+
+
+@pytest.mark.parametrize(("kind", "done"), [("std_msgs/msg/Bool", True), ("std_msgs/msg/Float64", 1.0)])
+@pytest.mark.parametrize(("values", "expected"), [
+    ([0] * 25 + [1] * 10, [False] * 21),  # put onto the goal while the table is reset
+    ([0] * 15 + [1] * 10 + [0] * 10, [False] * 15 + [True] * 6),  # cleared away afterwards
+    ([0] * 20 + [1] + [0] * 10, [False] * 20 + [True]),  # reached at the end, and the episode ends because of it
+])
+def test_what_a_detector_says_while_the_robot_is_reset_is_not_said_of_the_episode(
+    tmp_path: Path, values: list[float], expected: list[bool], kind: str, done: float
+) -> None:
+    rule = {"topic": "/success", "type": kind} | ({"above": 0.5} if kind != "std_msgs/msg/Bool" else {})
+    bag = Run(2, change=with_success(values, kind, done)).write(tmp_path / "bag")
+    contract = contract_file(tmp_path / "contract.yaml", episodes__success=rule)
+    for episode in imported([bag], contract, tmp_path / "out"):
+        assert episode.success.tolist() == expected
+        if "above" in rule:
+            assert (episode.rewards > 0.5).tolist() == expected[1:]
 
 
 def test_where_stamps_lie_in_another_era_the_time_of_reception_or_of_all_stamps_may_count(tmp_path: Path) -> None:

@@ -119,7 +119,8 @@ class Success(SettingsSection):
     """Which episodes succeeded: a topic, or a file of labels."""
 
     topic: str = ""
-    """Its newest message at or before t says it of frame t; the newest before the next episode, of the last frame."""
+    """Its newest message at or before t says it of frame t. Of the last frame the newest before the next episode says
+    it, or, where three or more came within the episode, the newest until half a step after its end."""
     type: Literal["std_msgs/msg/Bool", "std_msgs/msg/Float32", "std_msgs/msg/Float64"] = "std_msgs/msg/Bool"
     """Bool says success; a number is the reward, which is recorded too."""
     above: float | None = None
