@@ -174,6 +174,30 @@ def test_an_episode_without_a_label_is_named_by_its_bag_and_time(tmp_path: Path)
         survey([bag], load_contract(contract))
 
 
+@pytest.mark.parametrize("rows", ["bag,0,4,1\nbag,3,9,0\n", "bag,0,4,1\nbag,0,4,1\n", "bag,,,0\nbag,5,9,1\n"])
+def test_rows_of_labels_that_overlap_are_refused(tmp_path: Path, rows: str) -> None:
+    bag = Run(2).write(tmp_path / "bag")
+    (tmp_path / "labels.csv").write_text(f"bag,start_s,end_s,success\nother,,,1\n{rows}")
+    contract = contract_file(tmp_path / "contract.yaml", episodes__success={"file": "labels.csv"})
+    with pytest.raises(BagError, match=r"labels\.csv have two rows of bag that overlap, 0 to (4|inf) s and \d to \d s"):
+        survey([bag], load_contract(contract))
+
+
+def test_bags_of_one_name_are_refused_where_labels_name_them(tmp_path: Path) -> None:
+    (tmp_path / "labels.csv").write_text("bag,start_s,end_s,success\nbag_0,,,1\n")
+    for labels, names in (("labels.csv", ("monday/bag_0", "tuesday/bag_0")), (None, ("monday/bag_1", "tuesday/bag_1"))):
+        for name in names:
+            (tmp_path / name).parent.mkdir(exist_ok=True)
+        bags = [Run(1).write(tmp_path / name) for name in names]
+        rule = {"episodes__success": {"file": labels}} if labels else {}
+        contract = load_contract(contract_file(tmp_path / "contract.yaml", **rule))
+        if labels:
+            with pytest.raises(BagError, match=r"monday/bag_0 and \S+tuesday/bag_0 have one name, and .*; rename one"):
+                survey(bags, contract)
+        else:
+            assert len(survey(bags, contract).episodes) == 2
+
+
 def test_a_bag_of_ros_1_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:
     with pytest.raises(BagError, match=r"run `rosbags-convert --src \S+run\.bag --dst \S+run`"):
         survey([tmp_path / "run.bag"], load_contract(EXAMPLE))

@@ -126,8 +126,8 @@ class Success(SettingsSection):
     above: float | None = None
     """A reward above it is a success."""
     file: str = ""
-    """CSV with the columns bag, start_s, end_s, success (0 or 1), s since the bag's first message; empty start_s and
-    end_s: the whole bag. A path in the contract's folder. It labels the last frame."""
+    """CSV with the columns bag (its folder's name), start_s, end_s, success (0 or 1), s since the bag's first message;
+    empty start_s and end_s: the whole bag. A path in the contract's folder. It labels the last frame."""
 
     @model_validator(mode="after")
     def _one(self) -> Self:

@@ -10,6 +10,7 @@ import csv
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -305,13 +306,22 @@ def _stretches(joined: BoolArray) -> list[tuple[int, int]]:
 
 
 def _labels_of(file: str, bag: str) -> Sequence[tuple[float, float, bool]]:
-    """(start s, end s, success) of a bag in the file of labels. Raises BagError: no such file, column or number."""
+    """(start s, end s, success) of a bag in the file of labels, in the order of time.
+
+    Raises:
+        BagError: no such file, column or number, or rows that overlap.
+    """
     try:
         with Path(file).open(newline="", encoding="utf-8") as stream:
-            return [
+            rows = sorted(
                 (float(row["start_s"] or 0), float(row["end_s"] or np.inf), bool(int(row["success"])))
                 for row in csv.DictReader(stream) if row["bag"] == bag
-            ]
+            )
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise BagError(f"labels {file} cannot be read: {error}; it is a CSV with the columns "
                        f"{', '.join(LABEL_COLUMNS)}, success 0 or 1") from None
+    for (start_s, end_s, _), (next_s, last_s, _) in pairwise(rows):
+        if next_s < end_s:
+            raise BagError(f"labels {file} have two rows of {bag} that overlap, {start_s:g} to {end_s:g} s and "
+                           f"{next_s:g} to {last_s:g} s; leave one row for each time")
+    return rows

@@ -114,7 +114,7 @@ def survey(paths: Sequence[Path], contract: Contract) -> Survey:
     Raises:
         BagError: names what does not fit the contract, with the remedies.
     """
-    result, paths = Survey(contract), list(dict.fromkeys(paths))
+    result, paths = Survey(contract), _distinct(paths, contract.episodes.success.file)
     for path in paths:
         if path.suffix == ROS_1:
             raise BagError(f"{path} is a bag of ROS 1; run `rosbags-convert --src {path} --dst {path.with_suffix('')}`"
@@ -128,6 +128,16 @@ def survey(paths: Sequence[Path], contract: Contract) -> Survey:
                 result.topics.setdefault(place, TopicRow(stream.source.topic, stream.clock)).add(stream)
             result.planned[path] = Planner(path.name, bag.start_ns, streams, contract, result.tally).episodes()
     return result
+
+
+def _distinct(paths: Sequence[Path], labels: str) -> list[Path]:
+    """Each bag once. Raises BagError: two of one name, which the file of labels cannot tell apart."""
+    distinct, named = list(dict.fromkeys(paths)), dict[str, Path]()
+    for path in distinct:
+        if labels and named.setdefault(path.name, path) is not path:
+            raise BagError(f"{named[path.name]} and {path} have one name, and {labels} names bags by it; rename one of "
+                           "them, there too")
+    return distinct
 
 
 def _gap(gap: tuple[float, str] | None) -> str:
