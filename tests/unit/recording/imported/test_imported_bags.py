@@ -33,7 +33,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
 from wm_nodes.core.specs import SOURCE_REAL
-from wm_nodes.core.types import Episode
+from wm_nodes.core.types import TRY, Episode
 from wm_nodes.policy_rl.pretraining import model_from_data, read_recordings
 from wm_nodes.recording import Bag, RawBagWriter, read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import stack_episodes
@@ -215,6 +215,19 @@ def test_a_stretch_with_a_gap_is_lost_and_counted_and_nothing_is_filled(tmp_path
     assert report.tally.missing["images.front"] == 4
     assert "0.60 s in bag at 0.7 s" in report.table()
     assert "left out: 5 steps in gaps and short stretches" in report.table()
+
+
+def test_the_stretches_of_one_try_carry_its_number(tmp_path: Path) -> None:
+    def gaps(messages: list[Message]) -> list[Message]:
+        begins = [time_ns for time_ns, topic, one in messages if topic == "/episode" and one.data]
+        return [(time_ns, topic, one) for time_ns, topic, one in messages if topic != FRONT or not any(
+            begin + 800 * MS <= time_ns < begin + 1300 * MS for begin in begins[:1]
+        )]
+
+    bags = [Run(2, change=gaps).write(tmp_path / day / "bag") for day in ("monday", "tuesday")]
+    episodes = imported(bags, EXAMPLE, tmp_path / "out")
+    assert [episode.extra[TRY] for episode in episodes] == [1, 1, 2, 3, 3, 4]
+    assert "bags: 2; episodes: 6 of 4 tries, " in survey(bags, load_contract(EXAMPLE)).table()
 
 
 def test_episodes_of_which_a_command_is_too_old_are_left_out_and_its_topic_is_named(tmp_path: Path) -> None:

@@ -198,6 +198,14 @@ def test_bags_of_one_name_are_refused_where_labels_name_them(tmp_path: Path) -> 
             assert len(survey(bags, contract).episodes) == 2
 
 
+def test_a_bag_and_its_own_file_are_refused(tmp_path: Path) -> None:
+    bag = Run(1).write(tmp_path / "bag")
+    (file,) = bag.glob("*.mcap")
+    with pytest.raises(BagError, match=rf"{file} is a file of {bag}, and its episodes would be there twice"):
+        survey([file, bag], load_contract(EXAMPLE))
+    assert len(survey([bag, bag / ".." / "bag"], load_contract(EXAMPLE)).planned) == 1
+
+
 def test_a_bag_of_ros_1_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:
     with pytest.raises(BagError, match=r"run `rosbags-convert --src \S+run\.bag --dst \S+run`"):
         survey([tmp_path / "run.bag"], load_contract(EXAMPLE))

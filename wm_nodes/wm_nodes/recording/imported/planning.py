@@ -62,12 +62,16 @@ class PlannedEpisode:
     """(T,), NaN where none is recorded."""
     instruction: str
     """What was asked for."""
+    try_number: int
+    """Of its span, among those of all bags."""
 
 
 @dataclass
 class Tally:
     """What planning counted."""
 
+    spans: int = 0
+    """Of all bags."""
     ticks: int = 0
     """Of all spans, from their first to their last command."""
     missing: Counter[str] = field(default_factory=Counter)
@@ -139,6 +143,7 @@ class Planner:
 
     def _of_span(self, span: Span) -> list[PlannedEpisode]:
         contract, tally, ticks = self.contract, self.tally, self._ticks(span)
+        tally.spans += 1
         commands, has = self._commands(ticks)
         moved = np.flatnonzero(has.all(1))
         if not len(moved):
@@ -169,7 +174,7 @@ class Planner:
             planned.append(PlannedEpisode(
                 ticks[frames], pictures[frames], states[frames].astype(np.float32),
                 np.clip(actions[rows], -1, 1).astype(np.float32), probes[frames].astype(np.float32), success[frames],
-                rewards[frames][1:], instruction,
+                rewards[frames][1:], instruction, tally.spans,
             ))
         tally.lost["in gaps and short stretches"] += len(joined) - covered
         if success[-1] and not (planned and planned[-1].ticks[-1] == ticks[-1]):
@@ -254,7 +259,7 @@ class Planner:
             self.tally.beyond[name] += int((np.abs(actions[:, column]) > 1 + 1e-6).sum())
 
     def _outcome(self, ticks: Times, span: Span) -> tuple[BoolArray, FloatArray]:
-        """(K,) success at each frame, and (K,) the reward for reaching it: NaN where none came since the tick before."""
+        """(K,) success at each frame, and (K,) the reward for reaching it, NaN where none came since the last."""
         success, rewards = np.zeros(len(ticks), bool), np.full(len(ticks), np.nan, np.float32)
         says = self.streams.get("success")
         if says is None:
