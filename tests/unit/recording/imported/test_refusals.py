@@ -89,6 +89,13 @@ def stamped(topic: str, change: Callable[[int], int]) -> Change:
     return restamp
 
 
+def behind(by_ms: int) -> Change:
+    """Everything is received so much later, and more of the camera."""
+    return lambda messages: [
+        (time_ns + (by_ms - 5 + 20 * (topic == FRONT)) * MS, topic, one) for time_ns, topic, one in messages
+    ]
+
+
 def slow(topic: str, keep: int) -> Change:
     def thin(messages: list[Message]) -> list[Message]:
         kept = [each for each in messages if each[1] == topic][::keep]
@@ -142,6 +149,8 @@ BAGS: dict[str, tuple[Change | None, dict[str, Any], str]] = {
                         "has stamps that fall by 1.1 s; set its timeline to receive"),
     "clocks apart": (stamped(FRONT, lambda now: now - 900 * MS), {}, "lie 905 ms apart, and max_clock_offset_ms is "
                      "500; set timeline to receive, or synchronise"),
+    "recorder behind": (behind(400), {}, "actions.1, split, success count from their reception, which is 400 ms after "
+                        "the stamps of images.wrist, more than half a step of rate_hz, 50 ms; set timeline: receive"),
     "a clock that was set": (stamped(JOINTS, lambda now: now - BEGIN_NS * (now < BEGIN_NS + 2000 * MS) + 1),
                              {"episodes__split": {"per": "bag"}}, "lasts 472222 h: a clock was set while"),
     "header of none": (None, {"observations__state__1__timeline": "header"},
@@ -164,6 +173,17 @@ def test_a_bag_that_does_not_fit_the_contract_is_refused_with_the_remedy_and_not
     refused = capsys.readouterr().err.splitlines()[-1]
     assert refused.startswith("error: ") and words in refused, refused
     assert not [*tmp_path.glob("out*")]
+
+
+@pytest.mark.parametrize(("by_ms", "changes"), [
+    (40, {}), (400, {"max_clock_offset_ms": 450}), (400, {"timeline": "receive"}),
+    (400, {"rate_hz": 1, "max_age_ms": 2000}),
+])
+def test_clocks_may_lie_half_a_step_apart_or_as_the_contract_says(
+    tmp_path: Path, by_ms: int, changes: dict[str, Any]
+) -> None:
+    bag = Run(1, seconds=6, change=behind(by_ms)).write(tmp_path / "bag")
+    assert survey([bag], load_contract(contract_file(tmp_path / "contract.yaml", **changes))).episodes
 
 
 def test_an_episode_without_a_label_is_named_by_its_bag_and_time(tmp_path: Path) -> None:

@@ -176,8 +176,9 @@ class Contract(SettingsSection):
     them; receive: all from when they were received."""
     max_age_ms: PositiveFloat = 300
     """A tick at which the newest sample of a topic is older has none: it ends the stretch, and nothing is filled."""
-    max_clock_offset_ms: PositiveFloat = 500
-    """By how much the stamps of two topics may lie apart when their messages are received at the same time."""
+    max_clock_offset_ms: PositiveFloat | None = None
+    """By how much the stamps of two topics may lie apart when their messages are received at the same time. None: 500;
+    and where some topics count from their reception, the least offset of the others may be half a step."""
     observations: Observations
     """What the policy sees."""
     actions: Annotated[tuple[Commands, ...], Field(min_length=1)]
