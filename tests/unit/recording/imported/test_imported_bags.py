@@ -363,6 +363,15 @@ def test_an_image_of_any_usual_encoding_is_read_as_rgb(encoding: str, padding: i
     np.testing.assert_array_equal(rgb_of(image(0, stored, encoding, padding)), expected)
 
 
+@pytest.mark.parametrize("form", ["png", "rgb8; png compressed bgr8", "bgr8; png compressed bgr8",
+                                  "rgb8; png compressed rgb8", "bgr8; png compressed rgb8"])
+def test_a_compressed_picture_is_read_in_the_order_that_its_format_says(form: str) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (4, 6, 3), dtype=np.uint8)
+    one = compressed(0, rgb[..., ::-1] if form.endswith("compressed rgb8") else rgb, "png")
+    one.format = form
+    np.testing.assert_array_equal(rgb_of(one), rgb)
+
+
 @pytest.mark.parametrize(("crop", "left", "right"), [("centre", 32, 95), ("none", 0, 127), ((0, 64, 96, 64), 64, 127)])
 def test_a_crop_keeps_the_part_that_it_names(crop: Any, left: int, right: int) -> None:
     ramp = np.repeat(np.arange(128, dtype=np.uint8)[None, :, None], 96, 0).repeat(3, -1)

@@ -72,6 +72,13 @@ def pictures(encoding: str, picture: Any) -> Change:
     ]
 
 
+def mosaic(messages: list[Message]) -> list[Message]:
+    for _, topic, one in messages:
+        if topic == FRONT:
+            one.format = "bayer_rggb8; jpeg compressed "
+    return messages
+
+
 def growing(messages: list[Message]) -> list[Message]:
     half = messages[len(messages) // 2][0]
     return [(time_ns, topic, image(time_ns, seen(0, 0, 64 + 32 * (time_ns > half), 96)) if topic == WRIST else one)
@@ -134,6 +141,7 @@ BAGS: dict[str, tuple[Change | None, dict[str, Any], str]] = {
              "have 64 x 64 px, and crop [0, 10, 64, 64] leaves them"),
     "depth": (pictures("16UC1", np.zeros((64, 64), np.uint16)), {}, "encoding '16UC1' is depth, which is not read"),
     "encoding": (pictures("yuv422", COLOURS), {}, "encoding 'yuv422' is not read; publish one of rgb8, bgr8"),
+    "mosaic": (mosaic, {}, "encoding 'bayer_rggb8; jpeg compressed ' is not read; publish one of rgb8, bgr8"),
     "no such joint": (None, {"observations__state__0__select": ["position.j1", "position.j9"]},
                       "no usable message with position.j1, position.j9"),
     "no velocities": (None, {"observations__state__0__select": ["velocity.j1", "velocity.j2"]},
