@@ -185,21 +185,39 @@ def test_of_several_commands_in_a_step_the_mean_over_time_or_the_last_counts(tmp
         np.testing.assert_allclose(episode.actions[:, 0], expected, atol=1e-6)
 
 
-def test_a_target_of_joints_may_count_as_the_change_from_the_state(tmp_path: Path) -> None:
-    def target(time_ns: int, step: int) -> Any:
+def with_targets(targets: list[tuple[float, float]], messages: list[Message]) -> list[Message]:
+    """Commands to j1 and j2 in place of velocities, 20 ms after each tick."""
+    def target(time_ns: int, j1: float, j2: float) -> Message:
         duration = message("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
-        point = message("trajectory_msgs/msg/JointTrajectoryPoint", positions=np.array([0.5, step + 0.25]),
+        point = message("trajectory_msgs/msg/JointTrajectoryPoint", positions=np.array([j2, j1]),
                         velocities=np.zeros(0), accelerations=np.zeros(0), effort=np.zeros(0), time_from_start=duration)
-        return message("trajectory_msgs/msg/JointTrajectory", header=header(time_ns), joint_names=["j2", "j1"],
-                       points=[point])
+        return time_ns, TWIST, message("trajectory_msgs/msg/JointTrajectory", header=header(time_ns),
+                                       joint_names=["j2", "j1"], points=[point])
 
-    messages = [each for each in stream(5) if each[1] != TWIST]
-    messages += [(now, TWIST, target(now, step)) for step, now in
-                 enumerate(range(BEGIN_NS + 20 * MS, BEGIN_NS + 500 * MS, 100 * MS))]
-    command = {"topic": TWIST, "type": "trajectory_msgs/msg/JointTrajectory", "select": ["position.j1", "position.j2"],
-               "unit": "rad", "low": [-1, -1], "high": [1, 1], "resample": "last", "relative_to": "state"}
-    (episode,) = one_topic(tmp_path, messages, actions__0=command)
+    return [each for each in messages if each[1] != TWIST] + [
+        target(BEGIN_NS + (100 * step + 20) * MS, j1, j2) for step, (j1, j2) in enumerate(targets)
+    ]
+
+
+TARGETS = {"topic": TWIST, "type": "trajectory_msgs/msg/JointTrajectory", "select": ["position.j1", "position.j2"],
+           "unit": "rad", "low": [-1, -1], "high": [1, 1], "resample": "last", "relative_to": "state"}
+
+
+def test_a_target_of_joints_may_count_as_the_change_from_the_state(tmp_path: Path) -> None:
+    (episode,) = one_topic(tmp_path, with_targets([(step + 0.25, 0.5) for step in range(5)], stream(5)),
+                           actions__0=TARGETS)
     np.testing.assert_allclose(episode.actions, [[0.25, 0.5]] * 4, atol=1e-6)
+
+
+def test_a_change_of_an_angle_is_the_shorter_way_round_and_that_of_a_length_is_as_commanded(tmp_path: Path) -> None:
+    messages = with_targets([(step + 0.25 - 2 * np.pi, 2 * np.pi - 0.5) for step in range(5)], stream(5))
+    for unit, limits in ({"rad": [1, 1], "m": [10, 10]}).items():
+        folder = tmp_path / unit
+        folder.mkdir()
+        changes = {"unit": unit, "low": [-limit for limit in limits], "high": limits}
+        (episode,) = one_topic(folder, messages, actions__0={**TARGETS, **changes})
+        expected = [0.25, -0.5] if unit == "rad" else [0.025 - np.pi / 5, np.pi / 5 - 0.05]
+        np.testing.assert_allclose(episode.actions, [expected] * 4, atol=1e-6)
 
 
 def test_a_stretch_with_a_gap_is_lost_and_counted_and_nothing_is_filled(tmp_path: Path) -> None:

@@ -79,7 +79,8 @@ class Commands(Numbers):
     """What the action of a step is: the mean over its time (velocities), or the last command (positions). A command
     holds until the next; one that is older than max_age_ms at the tick no longer counts."""
     relative_to: Literal["nothing", "state"] = "nothing"
-    """state: the command less the state value of the same name at t, as for targets of joints."""
+    """state: the command less the state value of the same name at t, as for targets of joints; of unit rad the shorter
+    way round, in [-pi, pi)."""
 
     @model_validator(mode="after")
     def _box(self) -> Self:

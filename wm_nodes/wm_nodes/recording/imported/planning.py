@@ -237,11 +237,14 @@ class Planner:
         return np.concatenate([values for values, _ in parts], 1), np.stack([has for _, has in parts], 1)
 
     def _relative(self, commands: NDArray[np.float64], states: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(K, A) commands, those of joints' targets as changes."""
+        """(K, A) commands, those of joints' targets as changes; of angles the shorter way round."""
         names, commands = self.contract.state_names, commands.copy()
-        relative = [source.relative_to == "state" for source in self.contract.actions for _ in source.select]
-        for column in np.flatnonzero(relative):
-            commands[:, column] -= states[:, names.index(self.contract.action_names[column])]
+        sources = [source for source in self.contract.actions for _ in source.select]
+        for column, source in enumerate(sources):
+            if source.relative_to == "state":
+                commands[:, column] -= states[:, names.index(self.contract.action_names[column])]
+                if source.unit == "rad":
+                    commands[:, column] = (commands[:, column] + np.pi) % (2 * np.pi) - np.pi
         return commands
 
     def _scaled(self, commands: NDArray[np.float64]) -> NDArray[np.float64]:
