@@ -12,7 +12,7 @@ from recording_graph import write as write_live
 from recording_samples import make_episode, make_spec
 
 from wm_nodes.core.specs import EnvironmentSpec
-from wm_nodes.core.types import Episode
+from wm_nodes.core.types import TRY, Episode
 from wm_nodes.recording import BagError, EpisodeBagWriter, topics
 from wm_nodes.recording import messages as m
 from wm_nodes.recording.training_data import PART_STEPS, TrainingData, read_training_data
@@ -75,6 +75,25 @@ def test_a_long_episode_is_cut_in_parts_that_hold_every_step_and_stay_on_one_sid
         np.testing.assert_array_equal(np.concatenate(data.training.actions[row : row + 3, :43]), one.actions)
         np.testing.assert_array_equal(data.training.images[row + 2, 43], one.images[-1])
     assert "8 long episodes in 24 parts, with every step" in data.summary
+
+
+def test_episodes_of_one_try_stay_on_one_side_and_count_as_one(tmp_path: Path) -> None:
+    def of_try(most: int) -> Callable[[Episode], Episode]:
+        return lambda e: replace(e, extra={TRY: e.episode_id // most})
+
+    bag = write(tmp_path / "bag", episodes(32, change=of_try(3)))
+    data = read(bag)
+    tries = [{(seed - 1000) // 3 for seed in side.seeds} for side in (data.training, data.heldout)]
+    assert not tries[0] & tries[1] and tries[0] | tries[1] == set(range(11))
+    assert "32 episodes of 11 tries; those of one try are all trained on or all held out" in data.summary
+    whole, numbered = (write(tmp_path / name, episodes(20, change=change)) for name, change in (
+        ("whole", lambda e: e), ("numbered", of_try(1))
+    ))
+    assert read(whole).heldout.seeds == read(numbered).heldout.seeds
+    few = write(tmp_path / "few", episodes(14, change=of_try(2)))
+    assert refused(few).startswith(f"14 complete episodes of 7 tries in {few}, and 8 are needed")
+    same = write(tmp_path / "same", episodes(24, won=(4, 5), change=of_try(2)))
+    assert refused(same).startswith(f"1 of 12 tries in {same} succeed, and 2 are needed")
 
 
 def test_several_instructions_are_said_to_be_unread(tmp_path: Path) -> None:

@@ -85,6 +85,9 @@ RECOVERY, TAKEN_OVER = "recovery", "taken_over"
 first step.
 """
 
+TRY = "try"
+"""Episode.extra[TRY]: number, within its bag, of the try that the episode was cut out of; others may be of the same."""
+
 
 @dataclass(frozen=True)
 class Episode:

@@ -13,7 +13,7 @@ from wm_nodes.config.tasks import model_tasks, success_or_recorded
 from wm_nodes.core.errors import first_few
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import MODEL_FIELDS, EnvironmentSpec
-from wm_nodes.core.types import BoolArray, Episode
+from wm_nodes.core.types import TRY, BoolArray, Episode
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.recording.errors import BagError
 from wm_nodes.recording.reader import BagReport, check_spec, read_episodes, read_spec
@@ -49,6 +49,8 @@ def read_training_data(
 ) -> tuple[TrainingData, list[Episode]]:
     """Read the complete episodes of bags and hold a share of those that succeed, and of those that do not, back.
 
+    Episodes of one try (core.types.TRY) are counted as one and stay together.
+
     Args:
         num_heldout: most episodes to hold out; at most a quarter is, and at least one of each kind.
         task: that the bags must be of; empty: any.
@@ -63,28 +65,31 @@ def read_training_data(
             any success, or with too few episodes.
     """
     recorded = spec = _common_spec(bags, task, check)
-    episodes, lost = _read(bags, spec)
+    episodes, tries, lost = _read(bags, spec)
     if not ground_truth:
         spec = replace(spec, ground_truth_names=())
         episodes = [replace(episode, ground_truth=episode.ground_truth[:, :0]) for episode in episodes]
-    named = ", ".join(map(str, bags))
-    if len(episodes) < MIN_EPISODES:
+    named, num_tries = ", ".join(map(str, bags)), len(set(tries))
+    of_tries = f" of {num_tries} tries" if num_tries < len(episodes) else ""
+    if num_tries < MIN_EPISODES:
         more = "".join(f"; {line}" for line in lost)
-        raise BagError(f"{_count(len(episodes), 'complete episode')} in {named}, and {MIN_EPISODES} are needed, a "
-                       f"quarter of them to judge the model by; record more{more}")
+        raise BagError(f"{_count(len(episodes), 'complete episode')}{of_tries} in {named}, and {MIN_EPISODES} are "
+                       f"needed, a quarter of them to judge the model by; record more{more}")
     if all(np.ptp(np.concatenate([e.actions[:, i] for e in episodes])) == 0 for i in range(spec.action_dim)):
         raise BagError(f"every action in {named} is {episodes[0].actions[0].tolist()}, so nothing shows what actions "
                        "do; record while the robot is commanded")
     won = np.array([success_or_recorded(spec.task, e.ground_truth, e.success)[1:].any() for e in episodes], bool)
-    if won.sum() < MIN_SUCCESSES:
-        raise BagError(f"{won.sum()} of {len(won)} episodes in {named} succeed, and {MIN_SUCCESSES} are needed, to "
-                       "learn when the task is done and to judge that; record successes, and set the success flag of "
-                       "wm/env/transition (success_probability) where the task is done")
+    won_tries = np.bincount(tries, won) > 0
+    if won_tries.sum() < MIN_SUCCESSES:
+        kind = "tries" if of_tries else "episodes"
+        raise BagError(f"{won_tries.sum()} of {num_tries} {kind} in {named} succeed, and {MIN_SUCCESSES} are needed, "
+                       "to learn when the task is done and to judge that; record successes, and set the success flag "
+                       "of wm/env/transition (success_probability) where the task is done")
     tasks = model_tasks(spec.task) if spec.ground_truth_names else (spec.task,)
     most = min(spec.max_episode_steps or PART_STEPS, PART_STEPS)
     parts = [[*_parts(episode, most)] for episode in episodes]
     longest = max(part.num_steps for of_one in parts for part in of_one)
-    held = _heldout(won, num_heldout, seed)
+    held = _heldout(won_tries, num_heldout, seed)[tries]  # one draw for each try
     training, heldout = (
         stack_episodes([part for of_one, its in zip(parts, held) if its == is_held for part in of_one], tasks,
                        num_steps=most if spec.ground_truth_names else longest)
@@ -92,7 +97,8 @@ def read_training_data(
     )
     chosen = [episode for episode, its in zip(episodes, held) if not its]
     withheld = ["the recorded ground truth is not used (data.ground_truth)"] if recorded != spec else []
-    summary = *_used(spec, episodes, parts, won, held), *withheld, *lost
+    cut = [f"{len(episodes)} episodes{of_tries}; those of one try are all trained on or all held out"] * bool(of_tries)
+    summary = *_used(spec, episodes, parts, won, held), *cut, *withheld, *lost
     return TrainingData(spec, tasks, training, heldout, len(chosen), summary), chosen
 
 
@@ -115,15 +121,19 @@ def _common_spec(bags: Sequence[Path], task: str, check: Callable[[EnvironmentSp
     return first
 
 
-def _read(bags: Sequence[Path], spec: EnvironmentSpec) -> tuple[list[Episode], list[str]]:
-    """All complete episodes, and a line for each way in which others were lost."""
-    episodes, lost = list[Episode](), list[str]()
+def _read(bags: Sequence[Path], spec: EnvironmentSpec) -> tuple[list[Episode], NDArray[np.int64], list[str]]:
+    """All complete episodes, (E,) the try of each, from 0, and a line for each way in which others were lost."""
+    episodes, tries, lost = list[Episode](), list[int](), list[str]()
+    numbers = dict[tuple[Path, bool, int], int]()
     for bag in bags:
         report = BagReport()
         for episode in read_episodes(bag, expected=spec, report=report):
             if episode.task not in {spec.task, *model_tasks(spec.task)}:
                 raise BagError(f"episode {episode.episode_id} in {bag} is of task {episode.task!r}, the bag of "
                                f"{spec.task!r}; train a model of each")
+            is_numbered = TRY in episode.extra
+            key = bag, is_numbered, episode.extra[TRY] if is_numbered else len(episodes)
+            tries.append(numbers.setdefault(key, len(numbers)))
             episodes.append(episode)
         if report.unfinished:
             lost.append(f"lost from {bag}: {_count(report.unfinished, 'episode')} cut off by the start or end of the "
@@ -134,7 +144,7 @@ def _read(bags: Sequence[Path], spec: EnvironmentSpec) -> tuple[list[Episode], l
         if report.lost_steps:
             lost.append(f"lost from {bag}: {_count(report.lost_steps, 'message')} of wm/env/transition that the "
                         "recorder did not get")
-    return episodes, lost or ["lost: nothing"]
+    return episodes, np.array(tries, np.int64), lost or ["lost: nothing"]
 
 
 def _parts(episode: Episode, most: int) -> Iterator[Episode]:

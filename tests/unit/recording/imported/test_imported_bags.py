@@ -1,6 +1,7 @@
 """Plain bags become ours: what is seen at a tick, what is commanded until the next, where episodes begin and end."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
 from wm_nodes.core.specs import SOURCE_REAL
-from wm_nodes.core.types import Episode
+from wm_nodes.core.types import TRY, Episode
 from wm_nodes.policy_rl.pretraining import model_from_data, read_recordings
 from wm_nodes.recording import Bag, RawBagWriter, read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import stack_episodes
@@ -184,21 +185,39 @@ def test_of_several_commands_in_a_step_the_mean_over_time_or_the_last_counts(tmp
         np.testing.assert_allclose(episode.actions[:, 0], expected, atol=1e-6)
 
 
-def test_a_target_of_joints_may_count_as_the_change_from_the_state(tmp_path: Path) -> None:
-    def target(time_ns: int, step: int) -> Any:
+def with_targets(targets: list[tuple[float, float]], messages: list[Message]) -> list[Message]:
+    """Commands to j1 and j2 in place of velocities, 20 ms after each tick."""
+    def target(time_ns: int, j1: float, j2: float) -> Message:
         duration = message("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
-        point = message("trajectory_msgs/msg/JointTrajectoryPoint", positions=np.array([0.5, step + 0.25]),
+        point = message("trajectory_msgs/msg/JointTrajectoryPoint", positions=np.array([j2, j1]),
                         velocities=np.zeros(0), accelerations=np.zeros(0), effort=np.zeros(0), time_from_start=duration)
-        return message("trajectory_msgs/msg/JointTrajectory", header=header(time_ns), joint_names=["j2", "j1"],
-                       points=[point])
+        return time_ns, TWIST, message("trajectory_msgs/msg/JointTrajectory", header=header(time_ns),
+                                       joint_names=["j2", "j1"], points=[point])
 
-    messages = [each for each in stream(5) if each[1] != TWIST]
-    messages += [(now, TWIST, target(now, step)) for step, now in
-                 enumerate(range(BEGIN_NS + 20 * MS, BEGIN_NS + 500 * MS, 100 * MS))]
-    command = {"topic": TWIST, "type": "trajectory_msgs/msg/JointTrajectory", "select": ["position.j1", "position.j2"],
-               "unit": "rad", "low": [-1, -1], "high": [1, 1], "resample": "last", "relative_to": "state"}
-    (episode,) = one_topic(tmp_path, messages, actions__0=command)
+    return [each for each in messages if each[1] != TWIST] + [
+        target(BEGIN_NS + (100 * step + 20) * MS, j1, j2) for step, (j1, j2) in enumerate(targets)
+    ]
+
+
+TARGETS = {"topic": TWIST, "type": "trajectory_msgs/msg/JointTrajectory", "select": ["position.j1", "position.j2"],
+           "unit": "rad", "low": [-1, -1], "high": [1, 1], "resample": "last", "relative_to": "state"}
+
+
+def test_a_target_of_joints_may_count_as_the_change_from_the_state(tmp_path: Path) -> None:
+    (episode,) = one_topic(tmp_path, with_targets([(step + 0.25, 0.5) for step in range(5)], stream(5)),
+                           actions__0=TARGETS)
     np.testing.assert_allclose(episode.actions, [[0.25, 0.5]] * 4, atol=1e-6)
+
+
+def test_a_change_of_an_angle_is_the_shorter_way_round_and_that_of_a_length_is_as_commanded(tmp_path: Path) -> None:
+    messages = with_targets([(step + 0.25 - 2 * np.pi, 2 * np.pi - 0.5) for step in range(5)], stream(5))
+    for unit, limits in ({"rad": [1, 1], "m": [10, 10]}).items():
+        folder = tmp_path / unit
+        folder.mkdir()
+        changes = {"unit": unit, "low": [-limit for limit in limits], "high": limits}
+        (episode,) = one_topic(folder, messages, actions__0={**TARGETS, **changes})
+        expected = [0.25, -0.5] if unit == "rad" else [0.025 - np.pi / 5, np.pi / 5 - 0.05]
+        np.testing.assert_allclose(episode.actions, [expected] * 4, atol=1e-6)
 
 
 def test_a_stretch_with_a_gap_is_lost_and_counted_and_nothing_is_filled(tmp_path: Path) -> None:
@@ -214,6 +233,19 @@ def test_a_stretch_with_a_gap_is_lost_and_counted_and_nothing_is_filled(tmp_path
     assert report.tally.missing["images.front"] == 4
     assert "0.60 s in bag at 0.7 s" in report.table()
     assert "left out: 5 steps in gaps and short stretches" in report.table()
+
+
+def test_the_stretches_of_one_try_carry_its_number(tmp_path: Path) -> None:
+    def gaps(messages: list[Message]) -> list[Message]:
+        begins = [time_ns for time_ns, topic, one in messages if topic == "/episode" and one.data]
+        return [(time_ns, topic, one) for time_ns, topic, one in messages if topic != FRONT or not any(
+            begin + 800 * MS <= time_ns < begin + 1300 * MS for begin in begins[:1]
+        )]
+
+    bags = [Run(2, change=gaps).write(tmp_path / day / "bag") for day in ("monday", "tuesday")]
+    episodes = imported(bags, EXAMPLE, tmp_path / "out")
+    assert [episode.extra[TRY] for episode in episodes] == [1, 1, 2, 3, 3, 4]
+    assert "bags: 2; episodes: 6 of 4 tries, " in survey(bags, load_contract(EXAMPLE)).table()
 
 
 def test_episodes_of_which_a_command_is_too_old_are_left_out_and_its_topic_is_named(tmp_path: Path) -> None:
@@ -269,6 +301,36 @@ def test_a_reward_is_recorded_and_says_where_success_begins(tmp_path: Path) -> N
     np.testing.assert_allclose(episode.rewards, [0.25, 0.5, 0.75, 1.0, 1.25])
 
 
+def with_success(values: list[float], kind: str, done: float) -> Callable[[list[Message]], list[Message]]:
+    """Run's messages, with success said from each episode's start on every 100 ms, in place of the verdict after it."""
+    def change(messages: list[Message]) -> list[Message]:
+        begins = [time_ns for time_ns, topic, one in messages if topic == "/episode" and one.data]
+        return [each for each in messages if each[1] != "/success"] + [
+            (begin_ns + tick * 100 * MS, "/success", message(kind, data=type(done)(value)))
+            for begin_ns in begins for tick, value in enumerate(values)
+        ]
+
+    return change
+
+
+@pytest.mark.parametrize(("kind", "done"), [("std_msgs/msg/Bool", True), ("std_msgs/msg/Float64", 1.0)])
+@pytest.mark.parametrize(("values", "expected"), [
+    ([0] * 25 + [1] * 10, [False] * 21),  # put onto the goal while the table is reset
+    ([0] * 15 + [1] * 10 + [0] * 10, [False] * 15 + [True] * 6),  # cleared away afterwards
+    ([0] * 20 + [1] + [0] * 10, [False] * 20 + [True]),  # reached at the end, and the episode ends because of it
+])
+def test_what_a_detector_says_while_the_robot_is_reset_is_not_said_of_the_episode(
+    tmp_path: Path, values: list[float], expected: list[bool], kind: str, done: float
+) -> None:
+    rule = {"topic": "/success", "type": kind} | ({"above": 0.5} if kind != "std_msgs/msg/Bool" else {})
+    bag = Run(2, change=with_success(values, kind, done)).write(tmp_path / "bag")
+    contract = contract_file(tmp_path / "contract.yaml", episodes__success=rule)
+    for episode in imported([bag], contract, tmp_path / "out"):
+        assert episode.success.tolist() == expected
+        if "above" in rule:
+            assert (episode.rewards > 0.5).tolist() == expected[1:]
+
+
 def test_where_stamps_lie_in_another_era_the_time_of_reception_or_of_all_stamps_may_count(tmp_path: Path) -> None:
     shifted = [(time_ns + 40 * 10**9, topic, one) for time_ns, topic, one in stream(6)]
     for timeline in ("header", "receive"):
@@ -317,6 +379,15 @@ def test_an_image_of_any_usual_encoding_is_read_as_rgb(encoding: str, padding: i
               "bgra8": np.concatenate([rgb[..., ::-1], alpha], -1), "mono8": rgb[..., :1]}[encoding]
     expected = np.repeat(rgb[..., :1], 3, -1) if encoding == "mono8" else rgb
     np.testing.assert_array_equal(rgb_of(image(0, stored, encoding, padding)), expected)
+
+
+@pytest.mark.parametrize("form", ["png", "rgb8; png compressed bgr8", "bgr8; png compressed bgr8",
+                                  "rgb8; png compressed rgb8", "bgr8; png compressed rgb8"])
+def test_a_compressed_picture_is_read_in_the_order_that_its_format_says(form: str) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (4, 6, 3), dtype=np.uint8)
+    one = compressed(0, rgb[..., ::-1] if form.endswith("compressed rgb8") else rgb, "png")
+    one.format = form
+    np.testing.assert_array_equal(rgb_of(one), rgb)
 
 
 @pytest.mark.parametrize(("crop", "left", "right"), [("centre", 32, 95), ("none", 0, 127), ((0, 64, 96, 64), 64, 127)])

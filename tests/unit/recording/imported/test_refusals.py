@@ -72,6 +72,13 @@ def pictures(encoding: str, picture: Any) -> Change:
     ]
 
 
+def mosaic(messages: list[Message]) -> list[Message]:
+    for _, topic, one in messages:
+        if topic == FRONT:
+            one.format = "bayer_rggb8; jpeg compressed "
+    return messages
+
+
 def growing(messages: list[Message]) -> list[Message]:
     half = messages[len(messages) // 2][0]
     return [(time_ns, topic, image(time_ns, seen(0, 0, 64 + 32 * (time_ns > half), 96)) if topic == WRIST else one)
@@ -87,6 +94,13 @@ def stamped(topic: str, change: Callable[[int], int]) -> Change:
         return messages
 
     return restamp
+
+
+def behind(by_ms: int) -> Change:
+    """Everything is received so much later, and more of the camera."""
+    return lambda messages: [
+        (time_ns + (by_ms - 5 + 20 * (topic == FRONT)) * MS, topic, one) for time_ns, topic, one in messages
+    ]
 
 
 def slow(topic: str, keep: int) -> Change:
@@ -127,6 +141,7 @@ BAGS: dict[str, tuple[Change | None, dict[str, Any], str]] = {
              "have 64 x 64 px, and crop [0, 10, 64, 64] leaves them"),
     "depth": (pictures("16UC1", np.zeros((64, 64), np.uint16)), {}, "encoding '16UC1' is depth, which is not read"),
     "encoding": (pictures("yuv422", COLOURS), {}, "encoding 'yuv422' is not read; publish one of rgb8, bgr8"),
+    "mosaic": (mosaic, {}, "encoding 'bayer_rggb8; jpeg compressed ' is not read; publish one of rgb8, bgr8"),
     "no such joint": (None, {"observations__state__0__select": ["position.j1", "position.j9"]},
                       "no usable message with position.j1, position.j9"),
     "no velocities": (None, {"observations__state__0__select": ["velocity.j1", "velocity.j2"]},
@@ -142,6 +157,8 @@ BAGS: dict[str, tuple[Change | None, dict[str, Any], str]] = {
                         "has stamps that fall by 1.1 s; set its timeline to receive"),
     "clocks apart": (stamped(FRONT, lambda now: now - 900 * MS), {}, "lie 905 ms apart, and max_clock_offset_ms is "
                      "500; set timeline to receive, or synchronise"),
+    "recorder behind": (behind(400), {}, "actions.1, split, success count from their reception, which is 400 ms after "
+                        "the stamps of images.wrist, more than half a step of rate_hz, 50 ms; set timeline: receive"),
     "a clock that was set": (stamped(JOINTS, lambda now: now - BEGIN_NS * (now < BEGIN_NS + 2000 * MS) + 1),
                              {"episodes__split": {"per": "bag"}}, "lasts 472222 h: a clock was set while"),
     "header of none": (None, {"observations__state__1__timeline": "header"},
@@ -166,12 +183,55 @@ def test_a_bag_that_does_not_fit_the_contract_is_refused_with_the_remedy_and_not
     assert not [*tmp_path.glob("out*")]
 
 
+@pytest.mark.parametrize(("by_ms", "changes"), [
+    (40, {}), (400, {"max_clock_offset_ms": 450}), (400, {"timeline": "receive"}),
+    (400, {"rate_hz": 1, "max_age_ms": 2000}),
+])
+def test_clocks_may_lie_half_a_step_apart_or_as_the_contract_says(
+    tmp_path: Path, by_ms: int, changes: dict[str, Any]
+) -> None:
+    bag = Run(1, seconds=6, change=behind(by_ms)).write(tmp_path / "bag")
+    assert survey([bag], load_contract(contract_file(tmp_path / "contract.yaml", **changes))).episodes
+
+
 def test_an_episode_without_a_label_is_named_by_its_bag_and_time(tmp_path: Path) -> None:
     bag = Run(2).write(tmp_path / "bag")
     (tmp_path / "labels.csv").write_text("bag,start_s,end_s,success\nbag,0,4,1\n")
     contract = contract_file(tmp_path / "contract.yaml", episodes__success={"file": "labels.csv"})
     with pytest.raises(BagError, match=r"has no row for bag at 7\.0 s, the middle of an episode; add one: bag,start_s"):
         survey([bag], load_contract(contract))
+
+
+@pytest.mark.parametrize("rows", ["bag,0,4,1\nbag,3,9,0\n", "bag,0,4,1\nbag,0,4,1\n", "bag,,,0\nbag,5,9,1\n"])
+def test_rows_of_labels_that_overlap_are_refused(tmp_path: Path, rows: str) -> None:
+    bag = Run(2).write(tmp_path / "bag")
+    (tmp_path / "labels.csv").write_text(f"bag,start_s,end_s,success\nother,,,1\n{rows}")
+    contract = contract_file(tmp_path / "contract.yaml", episodes__success={"file": "labels.csv"})
+    with pytest.raises(BagError, match=r"labels\.csv have two rows of bag that overlap, 0 to (4|inf) s and \d to \d s"):
+        survey([bag], load_contract(contract))
+
+
+def test_bags_of_one_name_are_refused_where_labels_name_them(tmp_path: Path) -> None:
+    (tmp_path / "labels.csv").write_text("bag,start_s,end_s,success\nbag_0,,,1\n")
+    for labels, names in (("labels.csv", ("monday/bag_0", "tuesday/bag_0")), (None, ("monday/bag_1", "tuesday/bag_1"))):
+        for name in names:
+            (tmp_path / name).parent.mkdir(exist_ok=True)
+        bags = [Run(1).write(tmp_path / name) for name in names]
+        rule = {"episodes__success": {"file": labels}} if labels else {}
+        contract = load_contract(contract_file(tmp_path / "contract.yaml", **rule))
+        if labels:
+            with pytest.raises(BagError, match=r"monday/bag_0 and \S+tuesday/bag_0 have one name, and .*; rename one"):
+                survey(bags, contract)
+        else:
+            assert len(survey(bags, contract).episodes) == 2
+
+
+def test_a_bag_and_its_own_file_are_refused(tmp_path: Path) -> None:
+    bag = Run(1).write(tmp_path / "bag")
+    (file,) = bag.glob("*.mcap")
+    with pytest.raises(BagError, match=rf"{file} is a file of {bag}, and its episodes would be there twice"):
+        survey([file, bag], load_contract(EXAMPLE))
+    assert len(survey([bag, bag / ".." / "bag"], load_contract(EXAMPLE)).planned) == 1
 
 
 def test_a_bag_of_ros_1_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:

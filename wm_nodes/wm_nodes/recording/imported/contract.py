@@ -79,7 +79,8 @@ class Commands(Numbers):
     """What the action of a step is: the mean over its time (velocities), or the last command (positions). A command
     holds until the next; one that is older than max_age_ms at the tick no longer counts."""
     relative_to: Literal["nothing", "state"] = "nothing"
-    """state: the command less the state value of the same name at t, as for targets of joints."""
+    """state: the command less the state value of the same name at t, as for targets of joints; of unit rad the shorter
+    way round, in [-pi, pi)."""
 
     @model_validator(mode="after")
     def _box(self) -> Self:
@@ -119,14 +120,15 @@ class Success(SettingsSection):
     """Which episodes succeeded: a topic, or a file of labels."""
 
     topic: str = ""
-    """Its newest message at or before t says it of frame t; the newest before the next episode, of the last frame."""
+    """Its newest message at or before t says it of frame t. Of the last frame the newest before the next episode says
+    it, or, where three or more came within the episode, the newest until half a step after its end."""
     type: Literal["std_msgs/msg/Bool", "std_msgs/msg/Float32", "std_msgs/msg/Float64"] = "std_msgs/msg/Bool"
     """Bool says success; a number is the reward, which is recorded too."""
     above: float | None = None
     """A reward above it is a success."""
     file: str = ""
-    """CSV with the columns bag, start_s, end_s, success (0 or 1), s since the bag's first message; empty start_s and
-    end_s: the whole bag. A path in the contract's folder. It labels the last frame."""
+    """CSV with the columns bag (its folder's name), start_s, end_s, success (0 or 1), s since the bag's first message;
+    empty start_s and end_s: the whole bag. A path in the contract's folder. It labels the last frame."""
 
     @model_validator(mode="after")
     def _one(self) -> Self:
@@ -175,8 +177,9 @@ class Contract(SettingsSection):
     them; receive: all from when they were received."""
     max_age_ms: PositiveFloat = 300
     """A tick at which the newest sample of a topic is older has none: it ends the stretch, and nothing is filled."""
-    max_clock_offset_ms: PositiveFloat = 500
-    """By how much the stamps of two topics may lie apart when their messages are received at the same time."""
+    max_clock_offset_ms: PositiveFloat | None = None
+    """By how much the stamps of two topics may lie apart when their messages are received at the same time. None: 500;
+    and where some topics count from their reception, the least offset of the others may be half a step."""
     observations: Observations
     """What the policy sees."""
     actions: Annotated[tuple[Commands, ...], Field(min_length=1)]

@@ -14,6 +14,10 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
     "bgra8": (4, cv2.COLOR_BGRA2RGB), "mono8": (1, cv2.COLOR_GRAY2RGB),
 }
 """Channels of an encoding, and OpenCV's conversion to RGB."""
+MOSAIC = "bayer_"
+"""How formats begin of compressed pictures with one colour a pixel, which would be read as grey."""
+RGB_ORDER = "compressed rgb8"
+"""How formats end of pictures that were compressed in this order; all others were in OpenCV's, BGR."""
 DEPTH = ("16UC1", "32FC1", "mono16", "compressedDepth")
 
 
@@ -26,7 +30,8 @@ def check_encoding(message: Any) -> None:
     encoding = message.encoding if hasattr(message, "encoding") else message.format
     if any(name in encoding for name in DEPTH):
         raise BagError(f"encoding {encoding!r} is depth, which is not read; record the colour pictures of this camera")
-    if hasattr(message, "encoding") and encoding not in ENCODINGS:
+    is_read = encoding in ENCODINGS if hasattr(message, "encoding") else not encoding.startswith(MOSAIC)
+    if not is_read:
         raise BagError(f"encoding {encoding!r} is not read; publish one of {', '.join(ENCODINGS)}, or compressed")
 
 
@@ -37,7 +42,8 @@ def rgb_of(message: Any) -> UInt8Array:
         decoded = cv2.imdecode(np.asarray(message.data, np.uint8), cv2.IMREAD_COLOR) if len(message.data) else None
         if decoded is None:
             raise DamagedPictureError(f"a {message.format!r} picture of {len(message.data)} bytes cannot be decoded")
-        return np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), np.uint8)
+        is_rgb = message.format.endswith(RGB_ORDER)
+        return np.asarray(decoded if is_rgb else cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), np.uint8)
     channels, conversion = ENCODINGS[message.encoding]
     height, width, step = message.height, message.width, message.step
     if step < width * channels or len(message.data) < height * step:

@@ -10,6 +10,7 @@ import csv
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,8 @@ from wm_nodes.recording.messages import NS_PER_S
 NEVER_NS = 2**63 - 1
 LONGEST_S = 86_400
 """Of an episode."""
+SEVERAL = 3
+"""Messages about success within an episode, from which on those that come after it no longer count."""
 LABEL_COLUMNS = ("bag", "start_s", "end_s", "success")
 
 
@@ -36,7 +39,7 @@ class Span:
     end_ns: int
     """Of its last tick, at most."""
     until_ns: int
-    """When the next one begins; what is said of its success before counts."""
+    """When the next one begins."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +62,16 @@ class PlannedEpisode:
     """(T,), NaN where none is recorded."""
     instruction: str
     """What was asked for."""
+    try_number: int
+    """Of its span, among those of all bags."""
 
 
 @dataclass
 class Tally:
     """What planning counted."""
 
+    spans: int = 0
+    """Of all bags."""
     ticks: int = 0
     """Of all spans, from their first to their last command."""
     missing: Counter[str] = field(default_factory=Counter)
@@ -136,6 +143,7 @@ class Planner:
 
     def _of_span(self, span: Span) -> list[PlannedEpisode]:
         contract, tally, ticks = self.contract, self.tally, self._ticks(span)
+        tally.spans += 1
         commands, has = self._commands(ticks)
         moved = np.flatnonzero(has.all(1))
         if not len(moved):
@@ -149,7 +157,7 @@ class Planner:
         if instruction is None:
             tally.lost_episodes["without an instruction"] += 1
             return []
-        seen, success = self._seen(ticks, has), self._success(ticks, span)
+        seen, (success, rewards) = self._seen(ticks, has), self._outcome(ticks, span)
         joined = seen[:-1] & seen[1:] & has[:-1].all(1)
         pictures = np.stack([stream.numbers[stream.newest(ticks)] for stream in self._images], 1)
         states, probes = self._newest(self._state, ticks), self._newest(self._probes, ticks)
@@ -166,7 +174,7 @@ class Planner:
             planned.append(PlannedEpisode(
                 ticks[frames], pictures[frames], states[frames].astype(np.float32),
                 np.clip(actions[rows], -1, 1).astype(np.float32), probes[frames].astype(np.float32), success[frames],
-                self._rewards(ticks[frames][1:]), instruction,
+                rewards[frames][1:], instruction, tally.spans,
             ))
         tally.lost["in gaps and short stretches"] += len(joined) - covered
         if success[-1] and not (planned and planned[-1].ticks[-1] == ticks[-1]):
@@ -229,11 +237,14 @@ class Planner:
         return np.concatenate([values for values, _ in parts], 1), np.stack([has for _, has in parts], 1)
 
     def _relative(self, commands: NDArray[np.float64], states: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(K, A) commands, those of joints' targets as changes."""
+        """(K, A) commands, those of joints' targets as changes; of angles the shorter way round."""
         names, commands = self.contract.state_names, commands.copy()
-        relative = [source.relative_to == "state" for source in self.contract.actions for _ in source.select]
-        for column in np.flatnonzero(relative):
-            commands[:, column] -= states[:, names.index(self.contract.action_names[column])]
+        sources = [source for source in self.contract.actions for _ in source.select]
+        for column, source in enumerate(sources):
+            if source.relative_to == "state":
+                commands[:, column] -= states[:, names.index(self.contract.action_names[column])]
+                if source.unit == "rad":
+                    commands[:, column] = (commands[:, column] + np.pi) % (2 * np.pi) - np.pi
         return commands
 
     def _scaled(self, commands: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -250,31 +261,31 @@ class Planner:
             self.tally.commanded[name] = min(low, float(values.min())), max(high, float(values.max()))
             self.tally.beyond[name] += int((np.abs(actions[:, column]) > 1 + 1e-6).sum())
 
-    def _success(self, ticks: Times, span: Span) -> BoolArray:
-        """(K,) success at each frame."""
-        success, says = np.zeros(len(ticks), bool), self.streams.get("success")
+    def _outcome(self, ticks: Times, span: Span) -> tuple[BoolArray, FloatArray]:
+        """(K,) success at each frame, and (K,) the reward for reaching it, NaN where none came since the last."""
+        success, rewards = np.zeros(len(ticks), bool), np.full(len(ticks), np.nan, np.float32)
+        says = self.streams.get("success")
         if says is None:
             success[-1] = self._label(span)
-            return success
+            return success, rewards
         if not len(says.times):
             self.tally.unlabelled += 1
-            return success
-        limit = self.contract.episodes.success.above
-        flags = says.values[:, 0] > (0 if limit is None else limit)
-        until = says.newest(np.append(ticks[:-1], span.until_ns - 1))
-        known = (until >= 0) & (says.times[until] >= span.start_ns)
+            return success, rewards
+        newest = says.newest(np.append(ticks[:-1], self._said_until_ns(says, span)))
+        values, times = says.values[newest, 0], says.times[newest]
+        known = (newest >= 0) & (times >= span.start_ns)
         self.tally.unlabelled += not known[-1]
-        success[:] = known & flags[until]
-        return success
+        success = known & (values > (self.contract.episodes.success.above or 0))
+        if says.source.type != BOOL:
+            rewards = np.where(known & (times > ticks - self.contract.period_ns), values, np.nan).astype(np.float32)
+        return success, rewards
 
-    def _rewards(self, ticks: Times) -> FloatArray:
-        """(T,) the newest reward at or before each of the ticks, and after the tick before it."""
-        says = self.streams.get("success")
-        if says is None or says.source.type == BOOL or not len(says.times):
-            return np.full(len(ticks), np.nan, np.float32)
-        newest = says.newest(ticks)
-        is_of_step = (newest >= 0) & (says.times[newest] > ticks - self.contract.period_ns)
-        return np.where(is_of_step, says.values[newest, 0], np.nan).astype(np.float32)
+    def _said_until_ns(self, says: Stream, span: Span) -> int:
+        """Until when what is said of success counts for the last frame, see contract.Success.topic."""
+        first, last = np.searchsorted(says.times, [span.start_ns, span.end_ns + 1])
+        if last - first < SEVERAL:
+            return span.until_ns - 1
+        return min(span.until_ns - 1, span.end_ns + self.contract.period_ns // 2)
 
     def _instruction(self, span: Span) -> str | None:
         said = self.contract.episodes.instruction
@@ -303,13 +314,22 @@ def _stretches(joined: BoolArray) -> list[tuple[int, int]]:
 
 
 def _labels_of(file: str, bag: str) -> Sequence[tuple[float, float, bool]]:
-    """(start s, end s, success) of a bag in the file of labels. Raises BagError: no such file, column or number."""
+    """(start s, end s, success) of a bag in the file of labels, in the order of time.
+
+    Raises:
+        BagError: no such file, column or number, or rows that overlap.
+    """
     try:
         with Path(file).open(newline="", encoding="utf-8") as stream:
-            return [
+            rows = sorted(
                 (float(row["start_s"] or 0), float(row["end_s"] or np.inf), bool(int(row["success"])))
                 for row in csv.DictReader(stream) if row["bag"] == bag
-            ]
+            )
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise BagError(f"labels {file} cannot be read: {error}; it is a CSV with the columns "
                        f"{', '.join(LABEL_COLUMNS)}, success 0 or 1") from None
+    for (start_s, end_s, _), (next_s, last_s, _) in pairwise(rows):
+        if next_s < end_s:
+            raise BagError(f"labels {file} have two rows of {bag} that overlap, {start_s:g} to {end_s:g} s and "
+                           f"{next_s:g} to {last_s:g} s; leave one row for each time")
+    return rows

@@ -25,6 +25,8 @@ SAMPLED = ("images", "state", "actions", "probes")
 """Places in the contract that have a sample at every step."""
 FEWEST_PICTURES = 0.8
 """Pictures per step, below which a camera is too slow for rate_hz."""
+MAX_CLOCK_OFFSET_MS = 500
+"""Of two topics, where the contract says nothing."""
 SET_BACK_NS = NS_PER_S
 """Stamps that fall by more come from a clock that was set back, or from a second run."""
 
@@ -197,11 +199,24 @@ def read_streams(bag: Bag, contract: Contract) -> dict[str, Stream]:
 
 
 def _clock_problems(streams: list[Stream], contract: Contract) -> list[str]:
-    """Clocks that lie further apart than the contract allows."""
-    offsets = {stream.place: stream.offset_ms if stream.clock == "header" else 0.0 for stream in streams}
+    """Clocks that lie further apart than the contract allows.
+
+    A camera may be stamped long before its picture is received. Where every stamp is, the recorder was behind, and
+    topics that count from their reception come that much too late.
+    """
+    stamped = {stream.place: stream.offset_ms for stream in streams if stream.clock == "header"}
+    received = [stream.place for stream in streams if stream.clock == "receive" and len(stream.times)]
+    if stamped and received and contract.max_clock_offset_ms is None:
+        nearest = min(stamped, key=lambda place: abs(stamped[place]))
+        if abs(stamped[nearest]) > (half_ms := contract.period_ns / 2e6):
+            return [f"{', '.join(received)} count from their reception, which is {stamped[nearest]:.0f} ms after the "
+                    f"stamps of {nearest}, more than half a step of rate_hz, {half_ms:g} ms; set timeline: receive, or "
+                    "max_clock_offset_ms to what is right"]
+    offsets = {stream.place: 0.0 for stream in streams} | stamped
+    limit_ms = contract.max_clock_offset_ms or MAX_CLOCK_OFFSET_MS
     first, last = min(offsets, key=offsets.__getitem__), max(offsets, key=offsets.__getitem__)
     apart = offsets[last] - offsets[first]
-    if apart <= contract.max_clock_offset_ms:
+    if apart <= limit_ms:
         return []
     return [f"the clocks of {first} and {last} lie {apart:.0f} ms apart, and max_clock_offset_ms is "
-            f"{contract.max_clock_offset_ms:g}; set timeline to receive, or synchronise the clocks and record again"]
+            f"{limit_ms:g}; set timeline to receive, or synchronise the clocks and record again"]

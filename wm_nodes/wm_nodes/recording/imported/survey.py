@@ -76,12 +76,14 @@ class Survey:
              f"{tally.beyond[name]} ({tally.beyond[name] / tally.steps:.1%})")
             for name, (low, high) in tally.commanded.items()
         ]
+        tries = len({episode.try_number for episode in episodes})
+        of_tries = f" of {tries} tries" if tries < len(episodes) else ""
         successes = sum(bool(episode.success[-1]) for episode in episodes)
         lines = [
             *_aligned([header, *rows]), "",
             *_aligned([("command", "limits", "in the steps", "steps beyond"), *commands]), "",
-            f"bags: {len(self.planned)}; episodes: {len(episodes)}, {successes} of them end in success; steps: "
-            f"{tally.steps} of {contract.period_ns / 1e6:g} ms",
+            f"bags: {len(self.planned)}; episodes: {len(episodes)}{of_tries}, {successes} of them end in "
+            f"success; steps: {tally.steps} of {contract.period_ns / 1e6:g} ms",
             *(f"left out: {count} steps {reason}" for reason, count in tally.lost.items() if count),
             *(f"left out: {count} stretches {reason}" for reason, count in tally.lost_episodes.items()),
         ]
@@ -114,7 +116,7 @@ def survey(paths: Sequence[Path], contract: Contract) -> Survey:
     Raises:
         BagError: names what does not fit the contract, with the remedies.
     """
-    result, paths = Survey(contract), list(dict.fromkeys(paths))
+    result, paths = Survey(contract), _distinct(paths, contract.episodes.success.file)
     for path in paths:
         if path.suffix == ROS_1:
             raise BagError(f"{path} is a bag of ROS 1; run `rosbags-convert --src {path} --dst {path.with_suffix('')}`"
@@ -128,6 +130,23 @@ def survey(paths: Sequence[Path], contract: Contract) -> Survey:
                 result.topics.setdefault(place, TopicRow(stream.source.topic, stream.clock)).add(stream)
             result.planned[path] = Planner(path.name, bag.start_ns, streams, contract, result.tally).episodes()
     return result
+
+
+def _distinct(paths: Sequence[Path], labels: str) -> list[Path]:
+    """Each bag once.
+
+    Raises:
+        BagError: a bag and a file of it, or two of one name, which the file of labels cannot tell apart.
+    """
+    distinct, named = {path.resolve(): path for path in paths}, dict[str, Path]()
+    for place, path in distinct.items():
+        if place.parent in distinct:
+            raise BagError(f"{path} is a file of {distinct[place.parent]}, and its episodes would be there twice; name "
+                           "one of the two")
+        if labels and named.setdefault(path.name, path) is not path:
+            raise BagError(f"{named[path.name]} and {path} have one name, and {labels} names bags by it; rename one of "
+                           "them, there too")
+    return list(distinct.values())
 
 
 def _gap(gap: tuple[float, str] | None) -> str:

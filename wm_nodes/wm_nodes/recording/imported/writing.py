@@ -12,7 +12,7 @@ import numpy as np
 from wm_nodes.config.load import dump_config
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.specs import SOURCE_REAL, EnvironmentSpec
-from wm_nodes.core.types import Episode, UInt8Array
+from wm_nodes.core.types import TRY, Episode, UInt8Array
 from wm_nodes.recording.bag import Bag
 from wm_nodes.recording.errors import BagError
 from wm_nodes.recording.imported.contract import Contract, Numbers
@@ -119,7 +119,7 @@ def _episode(planned: PlannedEpisode, images: UInt8Array, contract: Contract, nu
         ground_truth=planned.probes, success=planned.success, rewards=planned.rewards,
         terminated=terminated, truncated=not terminated, task=contract.task, instruction=planned.instruction,
         behaviour=contract.episodes.behaviour, seed=number, episode_id=number, source=SOURCE_REAL,
-        extra={"bag": path.name, "first_tick_ns": int(planned.ticks[0])},
+        extra={"bag": path.name, "first_tick_ns": int(planned.ticks[0]), TRY: planned.try_number},
     )
 
 
