@@ -10,12 +10,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from benchmarks.speed.noop_environment import NoopEnvironment
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import PolicyConfig, RunConfig
 from wm_nodes.core.cameras import CameraModel, Matrix, intrinsics, look_at
 from wm_nodes.core.specs import SOURCE_REAL, SOURCE_SIMULATOR, EnvironmentSpec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
 from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.train import train_policy
@@ -118,6 +120,13 @@ class Robot(ReachToy):
 
 def make_robot(config: RunConfig, num_envs: int, seed: int) -> Robot:
     return Robot(num_envs, seed)
+
+
+def make_other_robot(config: RunConfig, num_envs: int, seed: int) -> NoopEnvironment:
+    """Has as many values as the robot of the configured task, and is another one."""
+    spec = simulation_spec(config.task, config.simulation, num_envs)
+    other = {"action_names": ("vx", "vy", "vz"), "action_scale": (1.0, 1.0, 1.0), "control_period_s": 0.02}
+    return NoopEnvironment(replace(spec, **other))
 
 
 def make_environment_of_large_images(config: RunConfig, num_envs: int, seed: int) -> ReachToy:
