@@ -127,15 +127,15 @@ def test_estop_ends_the_episodes_and_refuses_steps_until_it_is_released(client: 
 
 def test_a_robot_is_told_to_hold_by_an_emergency_stop_between_two_requests(graph: Graph, probe: Probe) -> None:
     estop = probe.publisher("safety/estop")
-    graph.start_environment("toy:make_robot", num_envs=N)
+    graph.start_environment("toy:make_robot", num_envs=1)
     client = Client(probe)
     wait_until("matching", estop.get_subscription_count)
     start = client.reset()
-    client.step(client.command(start.step_id + 1, np.full((N, 3), 0.5)))
+    client.step(client.command(start.step_id + 1, np.full((1, 3), 0.5)))
     estop.publish(Bool(data=True))
     wait_until("the hold", lambda: "\ntold 0\n" in graph.log("/wm/environment"))
     with pytest.raises(WireError, match="emergency stop"):
-        client.step(client.command(start.step_id + 2))
+        client.step(client.command(start.step_id + 2, np.zeros((1, 3))))
     assert graph.log("/wm/environment").count("told 0\n") == 1
 
 
