@@ -17,6 +17,7 @@ from wm_nodes.core.cameras import CameraModel, Matrix, intrinsics, look_at
 from wm_nodes.core.specs import SOURCE_REAL, SOURCE_SIMULATOR, EnvironmentSpec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+from wm_nodes.environments.batch import EnvironmentBatch, Frame
 from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
 from wm_nodes.policy_rl.ppo import PpoLearner
@@ -26,6 +27,7 @@ from wm_nodes.training.weights import pack_weights, unpack_weights
 
 SIDE_PX = 16
 STUCK_S = 12.0
+ARM_STEPS = 3
 SLOW_S = 0.3
 """One inference of make_slow_policy."""
 GOAL_M = np.array([0.6, 0.0, 0.1], np.float32)
@@ -120,6 +122,36 @@ class Robot(ReachToy):
 
 def make_robot(config: RunConfig, num_envs: int, seed: int) -> Robot:
     return Robot(num_envs, seed)
+
+
+class VelocityArm:
+    """A robot that goes on with the velocity that it was told last: `told VALUE` in the log."""
+
+    def reset(self, seed: int) -> Frame:
+        return Frame(np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8), GOAL_M, truth=(0.0, 0.0))
+
+    def step(self, action: FloatArray) -> Frame:
+        print(f"told {action[0]:g}", flush=True)
+        return self.reset(0)
+
+    def close(self) -> None: ...
+
+
+class HoldingArm(VelocityArm):
+    """Its action 0 is the middle of its limits, and no rest."""
+
+    def hold(self) -> None:
+        print("told to hold", flush=True)
+
+
+def make_velocity_arm(config: RunConfig, num_envs: int, seed: int) -> EnvironmentBatch:
+    """Of ARM_STEPS steps an episode."""
+    spec = replace(ReachToy(1, seed, ARM_STEPS).spec, source=SOURCE_REAL)
+    return EnvironmentBatch(spec, [VelocityArm()], seed)
+
+
+def make_holding_arm(config: RunConfig, num_envs: int, seed: int) -> EnvironmentBatch:
+    return EnvironmentBatch(make_velocity_arm(config, num_envs, seed).spec, [HoldingArm()], seed)
 
 
 def make_other_robot(config: RunConfig, num_envs: int, seed: int) -> NoopEnvironment:

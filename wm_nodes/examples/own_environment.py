@@ -32,6 +32,7 @@ class Arm:
         touches = np.linalg.norm(self._joints[:2] - (0.5, -0.3)) < 0.35
         return Frame(image, self._joints.astype(np.float32), success=bool(touches))
 
+    def hold(self) -> None: ...  # it stays by itself; left out, action 0 must mean that: changes, no absolute commands
     def close(self) -> None: ...
 
 

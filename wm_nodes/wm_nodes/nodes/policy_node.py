@@ -15,7 +15,7 @@ from wm_msgs.action import Rollout
 from wm_msgs.msg import ActionBatch, EnvSpec, ErrorCode, PolicyVersion
 from wm_msgs.srv import InferAction, LoadPolicy
 from wm_nodes.core.errors import WireError
-from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.specs import SOURCE_REAL, EnvironmentSpec
 from wm_nodes.core.types import UInt64Array
 from wm_nodes.nodes.factories import expected_spec, make_policy, refuse_for_policy
 from wm_nodes.nodes.policy.asynchronous import AsynchronousPolicy
@@ -124,6 +124,9 @@ class PolicyNode(ManagedNode):
         except (PeerLost, WireError, ValueError):
             self._last_reply = None
             raise
+        finally:
+            if self._asynchronous is None and self._spec is not None and self._spec.source == SOURCE_REAL:
+                self._publish_hold()  # no further step comes
 
     def _act(self, work: Work, result: Rollout.Result) -> None:
         goal: Rollout.Goal = work.request
