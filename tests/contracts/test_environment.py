@@ -34,7 +34,6 @@ def config_of(task: str) -> RunConfig:
 
 
 OWN = {
-    "arm": {"task": "", "environment.factory": f"{__name__}:make_real_arm"},
     "pendulum": {**PENDULUM, "gymnasium.kwargs": {"max_episode_steps": LIMIT}},
     **{preset: {"gymnasium.kwargs": {"max_episode_steps": LIMIT}} for preset in ("fetch_reach", "fetch_push")},
     "push_t": {"gymnasium.kwargs": load_config("push_t").gymnasium.kwargs | {"max_episode_steps": LIMIT}},
@@ -54,9 +53,9 @@ class RealArm(own_environment.Arm):
         return self.step(np.zeros(6, np.float32))
 
 
-def make_real_arm(config: RunConfig, num_envs: int, seed: int) -> EnvironmentBatch:
+def make_real_arms(seed: int) -> EnvironmentBatch:
     spec = replace(own_environment.SPEC, max_episode_steps=LIMIT)
-    return EnvironmentBatch(spec, [RealArm() for _ in range(num_envs)], seed)
+    return EnvironmentBatch(spec, [RealArm() for _ in range(N)], seed)
 
 
 def make_simulator(config: RunConfig, seed: int) -> Environment:
@@ -73,7 +72,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, WorldModels]:
 
 
 @pytest.fixture(
-    params=[*(f"{name}{kind}" for kind in CONFIGS for name in ("maniskill", "imagined", "still")), *OWN]
+    params=[*(f"{name}{kind}" for kind in CONFIGS for name in ("maniskill", "imagined", "still")), "arm", *OWN]
 )
 def make(request: pytest.FixtureRequest, models: dict[str, WorldModels]) -> Iterator[Make]:
     """Builds the environment under test from a root seed; what it built is closed."""
@@ -85,7 +84,9 @@ def make(request: pytest.FixtureRequest, models: dict[str, WorldModels]) -> Iter
 
     def build(seed: int) -> Environment:
         environment: Environment
-        if name in OWN:
+        if name == "arm":
+            environment = make_real_arms(seed)
+        elif name in OWN:
             if name in NEEDS and find_spec(NEEDS[name]) is None:
                 pytest.skip(f"{name} needs {NEEDS[name]}, see requirements/gym.txt")
             settings = load_config(name if name in preset_names() else "smoke", OWN[name])

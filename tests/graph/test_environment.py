@@ -6,9 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 from graph.harness import Graph, Probe, wait_until
+from graph.toy import ARM_STEPS
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 
+from wm_msgs.action import Rollout
 from wm_msgs.msg import EpisodeEvent, ErrorCode
 from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
 from wm_nodes.core.errors import WireError
@@ -127,16 +129,52 @@ def test_estop_ends_the_episodes_and_refuses_steps_until_it_is_released(client: 
 
 def test_a_robot_is_told_to_hold_by_an_emergency_stop_between_two_requests(graph: Graph, probe: Probe) -> None:
     estop = probe.publisher("safety/estop")
-    graph.start_environment("toy:make_robot", num_envs=N)
+    graph.start_environment("toy:make_robot", num_envs=1)
     client = Client(probe)
     wait_until("matching", estop.get_subscription_count)
     start = client.reset()
-    client.step(client.command(start.step_id + 1, np.full((N, 3), 0.5)))
+    client.step(client.command(start.step_id + 1, np.full((1, 3), 0.5)))
     estop.publish(Bool(data=True))
     wait_until("the hold", lambda: "\ntold 0\n" in graph.log("/wm/environment"))
     with pytest.raises(WireError, match="emergency stop"):
-        client.step(client.command(start.step_id + 2))
+        client.step(client.command(start.step_id + 2, np.zeros((1, 3))))
     assert graph.log("/wm/environment").count("told 0\n") == 1
+
+
+def told(graph: Graph) -> list[str]:
+    """What a toy's robot was told to do."""
+    return [line for line in graph.log("/wm/environment").splitlines() if line.startswith("told")]
+
+
+ARMS = [("toy:make_velocity_arm", "told 0"), ("toy:make_holding_arm", "told to hold")]
+
+
+@pytest.mark.parametrize(("factory", "hold"), ARMS)
+def test_a_robot_holds_when_its_episode_ends_and_again_by_an_emergency_stop_after_that(
+    graph: Graph, probe: Probe, factory: str, hold: str
+) -> None:
+    estop = probe.publisher("safety/estop")
+    graph.start_environment(factory, num_envs=1)
+    client = Client(probe)
+    wait_until("matching", estop.get_subscription_count)
+    first = client.reset().step_id + 1
+    replies = [client.step(client.command(first + i, np.full((1, 3), 0.75))) for i in range(ARM_STEPS)]
+    assert replies[-1].truncated.all()
+    assert told(graph) == ["told 0.75"] * ARM_STEPS + [hold]
+    estop.publish(Bool(data=True))
+    wait_until("the second hold", lambda: told(graph)[ARM_STEPS:] == [hold, hold])
+
+
+@pytest.mark.parametrize(("factory", "hold"), ARMS)
+def test_a_robot_holds_when_a_rollout_leaves_it_within_an_episode(
+    graph: Graph, probe: Probe, factory: str, hold: str
+) -> None:
+    graph.start_environment(factory, num_envs=1)
+    graph.start_policy()
+    result = probe.finish(probe.send(probe.action(Rollout, "rollout"), Rollout.Goal(steps=2, reset=True)))
+    assert result.termination_reason == Rollout.Result.FINISHED, result.message
+    wait_until("the hold", lambda: len(told(graph)) == 3)
+    assert told(graph)[2] == hold and hold not in told(graph)[:2]
 
 
 @pytest.mark.parametrize("reliability", [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT])

@@ -37,7 +37,10 @@ from wm_nodes.world_model import DeviceEnvironment, load_model_folder
 from wm_nodes.world_model.validation.acceptance import accept_world_model
 
 pytestmark = [pytest.mark.graph, pytest.mark.slow]
-STEPS = 120
+STEPS = 480
+"""Of all environments of a recording together."""
+NUM_ENVS = {"arm": 1, "pendulum": 4}
+"""A real robot is one, although 4 are asked for."""
 OWN = {
     "arm": {"environment.factory": "examples.own_environment:make"},
     "pendulum": drawn_pendulum.SETTINGS,
@@ -63,8 +66,9 @@ def config(own: str) -> RunConfig:
 
 
 @pytest.fixture(scope="module")
-def bag(config: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """What the recorder heard while a policy acted at random in four of them."""
+def bag(config: RunConfig, own: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """What the recorder heard while a policy acted at random in them."""
+    steps = STEPS // NUM_ENVS[own]
     with own_domain() as domain:
         graph, probe = Graph(domain, tmp_path_factory.mktemp("own") / "run", config), Probe(domain)
         graph.start("recorder", record_at_start=True)
@@ -72,7 +76,7 @@ def bag(config: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> Iterator
         graph.start_reward()
         graph.start("policy", policy__factory=UNTRAINED,
                     await_nodes=["environment", "reward_evaluator", "recorder"])
-        acted = probe.finish(probe.send(probe.action(Rollout, "rollout"), Rollout.Goal(steps=STEPS, reset=True)))
+        acted = probe.finish(probe.send(probe.action(Rollout, "rollout"), Rollout.Goal(steps=steps, reset=True)))
         stopped = probe.call(StopRecording, "recorder/stop", StopRecording.Request())
         probe.close()
         codes = graph.stop()
@@ -92,9 +96,11 @@ def model_dir(bag: Path, config: RunConfig, tmp_path_factory: pytest.TempPathFac
     return folder / "out" / "model"
 
 
-def test_the_recording_holds_the_spec_and_the_success_that_the_environment_says(bag: Path, config: RunConfig) -> None:
+def test_the_recording_holds_the_spec_and_the_success_that_the_environment_says(
+    bag: Path, config: RunConfig, own: str
+) -> None:
     spec, episodes = read_spec(bag), list(read_episodes(bag))
-    assert spec.spec_hash == configured_spec(config, 4).spec_hash
+    assert spec.spec_hash == configured_spec(config, NUM_ENVS[own]).spec_hash
     assert spec.measured == tuple(range(spec.state_dim)) and not spec.ground_truth_names
     won = [episode.success.any() for episode in episodes]
     assert any(won) and not all(won)
@@ -175,7 +181,7 @@ def test_the_example_records_an_environment_through_the_graph(
     settings = [word for name, value in OWN["arm"].items() for word in (f"--{name}", str(value))]
     done = subprocess.run(
         [sys.executable, "-m", "examples.record", str(tmp_path / "bag"), *settings, "--policy.factory", UNTRAINED,
-         "--steps", "20", "--num-envs", "2", "--domain-id", str(ros_domain)],
+         "--steps", "40", "--num-envs", "2", "--domain-id", str(ros_domain)],
         capture_output=True, encoding="utf-8", timeout=200, check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
@@ -193,7 +199,7 @@ def test_the_example_records_what_trained_weights_do_in_the_real_environment(
     settings = [word for name, value in OWN[own].items() if name != "task" for word in (f"--{name}", str(value))]
     done = subprocess.run(
         [sys.executable, "-m", "examples.record", str(tmp_path / "bag"), *settings, "--model-dir", str(model_dir),
-         "--initial-policy", str(weights), "--deterministic", "--steps", "20", "--num-envs", "2",
+         "--initial-policy", str(weights), "--deterministic", "--steps", "40", "--num-envs", "2",
          "--domain-id", str(ros_domain)],
         capture_output=True, encoding="utf-8", timeout=200, check=False,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},

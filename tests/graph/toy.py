@@ -10,12 +10,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from benchmarks.speed.noop_environment import NoopEnvironment
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import PolicyConfig, RunConfig
 from wm_nodes.core.cameras import CameraModel, Matrix, intrinsics, look_at
 from wm_nodes.core.specs import SOURCE_REAL, SOURCE_SIMULATOR, EnvironmentSpec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+from wm_nodes.environments.batch import EnvironmentBatch, Frame
+from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
 from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.train import train_policy
@@ -24,6 +27,7 @@ from wm_nodes.training.weights import pack_weights, unpack_weights
 
 SIDE_PX = 16
 STUCK_S = 12.0
+ARM_STEPS = 3
 SLOW_S = 0.3
 """One inference of make_slow_policy."""
 GOAL_M = np.array([0.6, 0.0, 0.1], np.float32)
@@ -118,6 +122,43 @@ class Robot(ReachToy):
 
 def make_robot(config: RunConfig, num_envs: int, seed: int) -> Robot:
     return Robot(num_envs, seed)
+
+
+class VelocityArm:
+    """A robot that goes on with the velocity that it was told last: `told VALUE` in the log."""
+
+    def reset(self, seed: int) -> Frame:
+        return Frame(np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8), GOAL_M, truth=(0.0, 0.0))
+
+    def step(self, action: FloatArray) -> Frame:
+        print(f"told {action[0]:g}", flush=True)
+        return self.reset(0)
+
+    def close(self) -> None: ...
+
+
+class HoldingArm(VelocityArm):
+    """Its action 0 is the middle of its limits, and no rest."""
+
+    def hold(self) -> None:
+        print("told to hold", flush=True)
+
+
+def make_velocity_arm(config: RunConfig, num_envs: int, seed: int) -> EnvironmentBatch:
+    """Of ARM_STEPS steps an episode."""
+    spec = replace(ReachToy(1, seed, ARM_STEPS).spec, source=SOURCE_REAL)
+    return EnvironmentBatch(spec, [VelocityArm()], seed)
+
+
+def make_holding_arm(config: RunConfig, num_envs: int, seed: int) -> EnvironmentBatch:
+    return EnvironmentBatch(make_velocity_arm(config, num_envs, seed).spec, [HoldingArm()], seed)
+
+
+def make_other_robot(config: RunConfig, num_envs: int, seed: int) -> NoopEnvironment:
+    """Has as many values as the robot of the configured task, and is another one."""
+    spec = simulation_spec(config.task, config.simulation, num_envs)
+    other = {"action_names": ("vx", "vy", "vz"), "action_scale": (1.0, 1.0, 1.0), "control_period_s": 0.02}
+    return NoopEnvironment(replace(spec, **other))
 
 
 def make_environment_of_large_images(config: RunConfig, num_envs: int, seed: int) -> ReachToy:

@@ -6,7 +6,6 @@ python -m wm_nodes.policy_rl.train --task "" --environment.factory examples.own_
 import numpy as np
 
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import SOURCE_REAL, EnvironmentSpec
 from wm_nodes.core.types import FloatArray
 from wm_nodes.environments.batch import EnvironmentBatch, Frame
@@ -22,7 +21,7 @@ SPEC = EnvironmentSpec(
 
 class Arm:
     def reset(self, seed: int) -> Frame:
-        self._joints = numpy_stream(seed, "arm").uniform(-0.6, 0.6, 6)
+        self._joints = np.random.default_rng(seed).uniform(-0.6, 0.6, 6)
         return self.step(np.zeros(6, np.float32))
 
     def step(self, action: FloatArray) -> Frame:
@@ -33,8 +32,9 @@ class Arm:
         touches = np.linalg.norm(self._joints[:2] - (0.5, -0.3)) < 0.35
         return Frame(image, self._joints.astype(np.float32), success=bool(touches))
 
+    def hold(self) -> None: ...  # it stays by itself; left out, action 0 must mean that: changes, no absolute commands
     def close(self) -> None: ...
 
 
 def make(config: RunConfig, num_envs: int, seed: int) -> EnvironmentBatch:
-    return EnvironmentBatch(SPEC, [Arm() for _ in range(num_envs)], seed)
+    return EnvironmentBatch(SPEC, [Arm()], seed)  # a real robot has num_envs 1, however many are asked for

@@ -60,7 +60,9 @@ class Environment(Protocol):
     An environment that has ended (terminated or truncated) stays put, with valid=False, until it is reset.
 
     Two attributes are optional: `ground_truth`, float32 (N, P) of the current observation, and `cameras`, a sequence of
-    core.cameras.CameraModel, some or all of spec.cameras, which people then see with calibration and frames.
+    core.cameras.CameraModel, some or all of spec.cameras, which people then see with calibration and frames. So is a
+    method of robots, `hold() -> None`: every one stays where it is, also after its episode. Without it action 0 is
+    stepped instead, see environments/batch.py.
     """
 
     spec: EnvironmentSpec

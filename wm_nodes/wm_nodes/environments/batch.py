@@ -1,15 +1,15 @@
 """One environment, a robot or a simulator, as a batch of them: what core.types.Environment asks beyond it. Shapes: N
 copies, A action, S state, H W 3 image."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from wm_nodes.core.seeding import stream_seed
-from wm_nodes.core.specs import EnvironmentSpec
-from wm_nodes.core.tool_control import check_actions
+from wm_nodes.core.specs import SOURCE_REAL, EnvironmentSpec
+from wm_nodes.core.tool_control import check_actions, hold_actions
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 
 
@@ -29,7 +29,12 @@ class Frame(NamedTuple):
 
 
 class SingleEnvironment(Protocol):
-    """What has to be written for an environment."""
+    """What has to be written for an environment.
+
+    A robot may also have `hold() -> None`: stay where it is. It is called at an emergency stop, at deactivation, in a
+    wait for credit, and when an episode or a rollout ends. Without it the robot is stepped with action 0 instead, which
+    must then mean to stay: it does not where commands are absolute, or 0 is the middle of limits such as 0 to 0.08 m.
+    """
 
     def reset(self, seed: int) -> Frame:
         """Begin an episode. seed: decides how, where that can be had; a real robot may leave it aside."""
@@ -44,7 +49,7 @@ class SingleEnvironment(Protocol):
 
 class EnvironmentBatch:
     """Copies that are stepped one after the other in this process; their episodes end with success, where a copy says
-    so, and after spec.max_episode_steps.
+    so, and after spec.max_episode_steps. A robot then holds until it is reset.
 
     Args:
         spec: of one of them.
@@ -79,11 +84,17 @@ class EnvironmentBatch:
         self._steps += valid.astype(np.uint32)
         truncated = valid & ~success & (over | (self._steps >= self.spec.max_episode_steps))
         self._ended = self._ended | success | truncated
+        if self.spec.source == SOURCE_REAL:
+            self._hold(np.flatnonzero(success | truncated))
         count = len(self._copies)
         return StepResult(
             self._observation(), success, truncated, success.astype(np.float32), np.zeros(count, np.float32),
             self.ground_truth.copy(), valid,
         )
+
+    def hold(self) -> None:
+        """Have every copy stay where it is, also one whose episode has ended; what it shows then is left aside."""
+        self._hold(range(len(self._copies)))
 
     def goals(self) -> tuple[UInt8Array, BoolArray] | None:
         return None
@@ -91,6 +102,14 @@ class EnvironmentBatch:
     def close(self) -> None:
         for copy in self._copies:
             copy.close()
+
+    def _hold(self, envs: Iterable[int]) -> None:
+        actions = hold_actions(self._states, self.spec)
+        for env in envs:
+            if hold := getattr(self._copies[env], "hold", None):
+                hold()
+            else:
+                self._copies[env].step(actions[env])
 
     def _show(self, env: int, frame: Frame) -> None:
         for name, value, kept in (

@@ -2,7 +2,7 @@
 
 maniskill: the configured task in ManiSkill. gymnasium: settings `gymnasium`. module:callable: an environment of your
 own, callable(config: RunConfig, num_envs: int, seed: int) -> Environment (core/types.py; environments/batch.py makes
-one of a single robot).
+one of a single robot). It may make fewer than num_envs, and of a real robot it makes one.
 """
 
 from contextlib import closing
@@ -11,7 +11,7 @@ from dataclasses import replace
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import has_simulator
 from wm_nodes.core.imports import load_factory
-from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.specs import SOURCE_REAL, EnvironmentSpec
 from wm_nodes.core.types import Environment
 from wm_nodes.environments.maniskill.spec import simulation_spec
 
@@ -27,7 +27,7 @@ def make_environment(
         pictures: False: where it can leave them black, it does; a step is then faster.
 
     Raises:
-        ValueError: none can be made by the settings; says which.
+        ValueError: none can be made by the settings; says which. Or a real robot was made several times.
     """
     environment: Environment
     if name == MANISKILL:
@@ -45,6 +45,13 @@ def make_environment(
         raise ValueError(f"no environment {name!r}; choose one of {', '.join(NAMES)}, or module:callable")
     else:
         environment = load_factory(name)(config, num_envs, seed)
+    spec = environment.spec
+    if spec.source == SOURCE_REAL and spec.num_envs > 1:
+        environment.close()
+        raise ValueError(
+            f"num_envs is {spec.num_envs}, and {spec.env_id} is a real robot, of which there is one: have {name} make "
+            "one, however many are asked for; or ask for one by num_envs:=1 and simulator_envs:=1, or ppo.num_envs 1"
+        )
     return environment
 
 

@@ -63,7 +63,7 @@ PARAMS = (
 class EnvironmentNode(ManagedNode):
     """Services env/step, env/reset, env/get_spec; topics env/image, env/transition, env/spec, env/goal, episode.
 
-    In mode asynchronous it follows `action`.
+    In mode asynchronous it follows `action`; in lock-step a robot obeys its MODE_HOLD, by which a rollout ends.
     """
 
     def __init__(self, **node_arguments: Any) -> None:
@@ -111,6 +111,7 @@ class EnvironmentNode(ManagedNode):
         self._asynchronous: AsynchronousEnvironment | None = None
         if self.param("mode") == "asynchronous":
             self._asynchronous = AsynchronousEnvironment(self.served, lambda: float(self.param("max_action_age_s")))
+        if self._asynchronous is not None or self.served.is_robot:
             self.listen("action", self._on_action)
 
     def activate(self) -> None:
@@ -224,7 +225,10 @@ class EnvironmentNode(ManagedNode):
         return response
 
     def _on_action(self, message: ActionBatch) -> None:
-        assert self._asynchronous is not None
+        if self._asynchronous is None:
+            if message.mode == ActionBatch.MODE_HOLD:
+                self._hold()
+            return
         if message.mode == ActionBatch.MODE_HOLD:
             self._asynchronous.hold()
             return

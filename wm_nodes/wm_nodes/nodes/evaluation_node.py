@@ -6,7 +6,7 @@ from typing import Any
 from wm_msgs.action import Evaluate
 from wm_msgs.msg import PolicyVersion
 from wm_nodes.nodes.environment.remote_environment import RemoteEnvironment
-from wm_nodes.nodes.factories import existing, make_policy
+from wm_nodes.nodes.factories import existing, expected_spec, make_policy, refuse_for_policy
 from wm_nodes.nodes.policy.weights import PolicyHolder, read_weights
 from wm_nodes.policy_rl.training_run import POLICY_FILES
 from wm_nodes.policy_rl.validation.evaluation import EvaluationResult, evaluate
@@ -39,8 +39,9 @@ class EvaluationNode(ManagedNode):
         super().__init__("evaluation", PARAMS, **node_arguments)
 
     def configure(self) -> None:
-        self._config = self.run_config()
-        self._holder = PolicyHolder(make_policy(self._config, str(self.param("model_dir"))))
+        self._config, model_dir = self.run_config(), str(self.param("model_dir"))
+        self._holder = PolicyHolder(make_policy(self._config, model_dir))
+        self._expected_spec = expected_spec(self._config, model_dir)
         self._files = named_files(self, str(self.param("initial_policy")))
         self._newest: PolicyVersion | None = None
         self._environment = RosEnvironmentClient(
@@ -66,6 +67,8 @@ class EvaluationNode(ManagedNode):
             self._environment, work.check, timeout_s=float(self.param("handshake_timeout_s")),
             behaviour=goal.behaviour or "policy", policy_version=result.policy_version,
         )
+
+        refuse_for_policy(environment.spec, self._expected_spec, self._holder.policy)
 
         def report(done: int, successes: int) -> None:
             work.feedback(Evaluate.Feedback(episodes_done=done, success_rate=successes / max(done, 1)))

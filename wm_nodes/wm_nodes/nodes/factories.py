@@ -72,6 +72,19 @@ def expected_spec(config: RunConfig, model_dir: str) -> EnvironmentSpec | None:
     return run_spec(config, Path(model_dir))
 
 
+def refuse_for_policy(served: EnvironmentSpec, expected: EnvironmentSpec | None, policy: ImagePolicy) -> None:
+    """Raise WireError(SPEC_MISMATCH) unless a policy can act in this environment. expected: of expected_spec."""
+    if expected is not None:
+        refuse_other(served, expected, "the policy needs")
+    found, needed = (served.state_dim, served.action_dim), (policy.state_dim, policy.action_dim)
+    if found != needed:
+        raise WireError(
+            ErrorCode.SPEC_MISMATCH,
+            f"environment {served.env_id} has {found} state and action values, the policy {needed}; "
+            "name a policy of this robot in policy.factory",
+        )
+
+
 def refuse_other(served: EnvironmentSpec, expected: EnvironmentSpec, whose: str) -> None:
     """Raise WireError(SPEC_MISMATCH) unless both agree, see core.specs.agree."""
     try:

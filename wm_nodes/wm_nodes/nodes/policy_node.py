@@ -15,9 +15,9 @@ from wm_msgs.action import Rollout
 from wm_msgs.msg import ActionBatch, EnvSpec, ErrorCode, PolicyVersion
 from wm_msgs.srv import InferAction, LoadPolicy
 from wm_nodes.core.errors import WireError
-from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.specs import SOURCE_REAL, EnvironmentSpec
 from wm_nodes.core.types import UInt64Array
-from wm_nodes.nodes.factories import expected_spec, make_policy, refuse_other
+from wm_nodes.nodes.factories import expected_spec, make_policy, refuse_for_policy
 from wm_nodes.nodes.policy.asynchronous import AsynchronousPolicy
 from wm_nodes.nodes.policy.weights import PolicyHolder, load_initial, read_weights
 from wm_nodes.policy_rl.image_policy import PolicyOutput
@@ -124,6 +124,9 @@ class PolicyNode(ManagedNode):
         except (PeerLost, WireError, ValueError):
             self._last_reply = None
             raise
+        finally:
+            if self._asynchronous is None and self._spec is not None and self._spec.source == SOURCE_REAL:
+                self._publish_hold()  # no further step comes
 
     def _act(self, work: Work, result: Rollout.Result) -> None:
         goal: Rollout.Goal = work.request
@@ -190,17 +193,8 @@ class PolicyNode(ManagedNode):
         return reset_seeds(goal.seed, version, step, spec.num_envs, self._envs_per_start)
 
     def _check_spec(self, spec: EnvironmentSpec) -> None:
-        if self._expected_spec is not None:
-            refuse_other(spec, self._expected_spec, "the policy needs")
-        policy = self._holder.policy
-        dims, expected = (spec.state_dim, spec.action_dim), (policy.state_dim, policy.action_dim)
-        if dims != expected:
-            raise WireError(
-                ErrorCode.SPEC_MISMATCH,
-                f"environment {spec.env_id} has {dims} state and action values, the policy {expected}; "
-                "name a policy of this robot in policy.factory",
-            )
         self._spec = spec
+        refuse_for_policy(spec, self._expected_spec, self._holder.policy)
 
     def _await_version(self, version: int, work: Work) -> None:
         deadline = time.monotonic() + float(self.param("version_timeout_s"))
@@ -249,12 +243,16 @@ class PolicyNode(ManagedNode):
         self.get_logger().warning(f"emergency stop {'set' if message.data else 'released'}")
 
     def _on_spec(self, message: EnvSpec) -> None:
+        agreed: EnvironmentSpec | None = None
         try:
-            self._spec = convert.spec_from_msg(message)
-            if self._asynchronous is not None:
-                self._asynchronous.spec = self._spec
+            spec = convert.spec_from_msg(message)
+            self._check_spec(spec)
+            agreed = spec
         except WireError as error:
+            self.get_logger().error(f"env/spec refused: {error}")
             self.diagnostics.count("refused_specs", level=diagnostics.ERROR, text=str(error))
+        if self._asynchronous is not None:
+            self._asynchronous.spec = agreed
 
     def _on_version(self, message: PolicyVersion) -> None:
         try:
@@ -271,6 +269,7 @@ class PolicyNode(ManagedNode):
         self.require_active()
         if self._spec is None:
             raise WireError(ErrorCode.NOT_ACTIVE, "no env/spec seen yet; start an environment or replay a bag")
+        self._check_spec(self._spec)
         count = len(request.state) // self._holder.policy.state_dim
         spec = replace(self._spec, num_envs=max(count, 1))
         states = floats(request.state, (spec.num_envs, spec.state_dim), "state")

@@ -181,8 +181,8 @@ class LockstepEnvironment:
         return self.spec.source == SOURCE_REAL
 
     def hold_now(self) -> BoolArray:
-        """Have a robot hold, which without further steps might go on with its last action, outside of any step; what is
-        imagined is left alone.
+        """Have a robot hold, which without further steps might go on with its last action, outside of any step: by its
+        own hold(), else by a step of the environment. What is imagined is left alone.
 
         Returns:
             (N,), whether the episode ended as it held: its environment stays put until it is reset.
@@ -192,6 +192,9 @@ class LockstepEnvironment:
         """
         with self._lock, self._environment_errors():
             if self._current is None or self.spec.source == SOURCE_IMAGINED:
+                return np.zeros(self.spec.num_envs, bool)
+            if self.is_robot and (hold := getattr(self.environment, "hold", None)):
+                hold()
                 return np.zeros(self.spec.num_envs, bool)
             result = self.environment.step(self.hold_actions())
             self._episodes.count_hold()
