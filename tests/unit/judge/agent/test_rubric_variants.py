@@ -3,6 +3,7 @@
 import asyncio
 from typing import Any
 
+import numpy as np
 import pytest
 from scripted_judge import (
     BORDERLINE,
@@ -11,6 +12,7 @@ from scripted_judge import (
     GOOD,
     POOR,
     UNUSABLE,
+    WRONG,
     ScriptedJudge,
     clean_table,
     make_clip,
@@ -20,8 +22,9 @@ from scripted_judge import (
 from wm_nodes.config.load import ConfigError
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import load_rubric
-from wm_nodes.judge.agent.types import Stage, Status
+from wm_nodes.judge.agent.types import Stage, Status, clip_ref
 from wm_nodes.judge.agent.verdict import Verdict
+from wm_nodes.judge.decisions import OVERALL, Decision, accepts, decisions_of
 
 VARIANTS = [
     f"robot_{name}" for name in (
@@ -44,9 +47,19 @@ def judged(pack: str, mode: Any = "reward", **table: Any) -> tuple[Verdict, list
 
 @pytest.mark.parametrize("pack", VARIANTS)
 @pytest.mark.parametrize("plan", [GOOD, FAIR, POOR])
-def test_a_clean_clip_still_earns_one(pack: str, plan: tuple[float, ...]) -> None:
+def test_a_clean_clip_still_earns_one_and_is_a_success(pack: str, plan: tuple[float, ...]) -> None:
     verdict, _ = judged(pack, planning=plan)
     assert verdict.status is Status.OK and verdict.reward == pytest.approx(1)
+    assert accepts(verdict) is True and decisions_of(verdict)[OVERALL] == Decision(True, 1.0)
+
+
+@pytest.mark.parametrize("pack", VARIANTS)
+def test_a_clip_that_fails_a_gate_or_the_task_or_shows_nothing_is_no_success(pack: str) -> None:
+    for failed in ({"robot": UNUSABLE}, {"task_completion": WRONG}, {"objective": UNUSABLE, "temporal": UNUSABLE}):
+        assert accepts(judged(pack, **failed)[0]) is False
+    black = clip_ref("black", np.zeros_like(make_clip().frames), 8.0)
+    agent = RewardAgent(ScriptedJudge(clean_table(ROBOT)), load_rubric(pack))
+    assert accepts(asyncio.run(agent.evaluate(black, make_task(black)))) is False
 
 
 @pytest.mark.parametrize("mode", ["reward", "benchmark"])
