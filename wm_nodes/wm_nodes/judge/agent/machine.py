@@ -47,6 +47,7 @@ from wm_nodes.judge.agent.verdict import (
 
 Mode = Literal["reward", "benchmark", "topreward"]
 CallPlan = Literal["pack", "fanout", "auto"]
+OUT_OF_ROUND = "no verdict by the round's deadline"
 
 
 class RewardAgent:
@@ -88,17 +89,20 @@ class RewardAgent:
         """Of the words that the judge is asked in: the rubric's, or that of mode topreward."""
         return topreward.VERSION if self.mode == topreward.MODE else self.rubric.version
 
-    async def evaluate(self, clip: ClipRef, task: TaskSpec, evidence: Evidence | None = None) -> Verdict:
-        """Judge one clip. evidence: causes votes and second looks, nothing else."""
+    async def evaluate(
+        self, clip: ClipRef, task: TaskSpec, evidence: Evidence | None = None, *, within_s: float = math.inf
+    ) -> Verdict:
+        """Judge one clip. evidence: causes votes and second looks, nothing else. within_s: what its round has left."""
         started, clock = time.time(), time.monotonic()
         run = _Run(self, clip, task, evidence or {})
         try:
-            async with asyncio.timeout(self.budget_s):
+            async with asyncio.timeout(min(self.budget_s, within_s)):
                 status, value, reason = await run.judge_clip()
         except _Stop as stop:
             status, value, reason = stop.status, math.nan, str(stop)
         except TimeoutError:
-            status, value, reason = Status.ERROR, math.nan, f"no verdict within {self.budget_s:g} s"
+            reason = OUT_OF_ROUND if within_s < self.budget_s else f"no verdict within {self.budget_s:g} s"
+            status, value = Status.ERROR, math.nan
         able = self.judge.capabilities
         verdict = Verdict(
             clip_id=clip.clip_id,
