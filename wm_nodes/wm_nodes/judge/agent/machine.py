@@ -286,14 +286,17 @@ class _Run:
             raise _Stop(Status.ERROR, f"no JSON answer was accepted, and letters alone are no judgement: {why}")
 
     async def _read_patterns(self) -> None:
-        """Read every hacking pattern once, and those that seem present again."""
+        """Read every hacking pattern once, and those that seem present again, which must be another question.
+
+        Where the first reads are letters, JSON being refused, they asked for defects worst first, as vote 1 does.
+        """
         rules, names = self.rubric.hack, tuple(self.rubric.hack.patterns)
         if not names:
             return
         first = await self._ask(Stage.HACK, names, levels.first_vote(self.agent.seed), Profile.D)
         present = {read.component: self._p_present(read) for read in first}
         seen = tuple(name for name in names if present[name] >= rules.confirm)
-        vote = levels.next_vote(1, self.agent.seed)
+        vote = levels.next_vote(2 if any(read.source == "label" for read in first) else 1, self.agent.seed)
         again = await self._ask(Stage.HACK, seen, vote, Profile.D) if seen else []
         confirmed = {read.component for read in again if self._p_present(read) >= rules.confirm}
         texts = {read.component: read.evidence_text for read in first}
