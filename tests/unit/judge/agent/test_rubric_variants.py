@@ -91,6 +91,14 @@ def test_without_planning_every_level_is_paid_and_voted_on_alike() -> None:
     assert judged("robot", planning=POOR, clarity=DOUBT)[0].reward not in rewards
 
 
+@pytest.mark.parametrize(("plan", "paid"), [(POOR, 0.80), (FAIR, 0.55), (GOOD, 0.30)])
+def test_an_undone_task_is_paid_more_at_a_worse_level_and_alike_without_planning(
+    plan: tuple[float, ...], paid: float
+) -> None:
+    rewards = [judged(pack, planning=plan, task_completion=UNUSABLE)[0].reward for pack in ("robot", "robot_no_planning")]
+    assert rewards == pytest.approx([paid, 0.30])
+
+
 def test_with_single_reads_the_first_answer_decides() -> None:
     table = {"clarity": [DOUBT, CLEAN, CLEAN], "task_completion": [BORDERLINE, CLEAN, CLEAN], "planning": FAIR}
     single, _ = judged("robot_single_read", **table)
