@@ -8,9 +8,9 @@ A line of clips.jsonl: {"file": "a.mp4", "instruction": "push the red bar away f
 sha256, which is checked.
 Verdicts are appended to CLIPS/verdicts.jsonl (`accepted`: whether the clip is a success; null where the judge cannot
 tell); started again, it goes on with the clips that were not judged by this judge, under these settings, with this task
-and these pictures (`key`, their hash). Verdicts with another key, those of older versions included, stay in the file, and
-their clips are judged again: the last line of a clip counts. A clip that cannot be read has an ERROR of its own. The exit
-code is 1 where a clip has an ERROR, or no clip at all has a reward.
+and these pictures (`key`, their hash). Verdicts with another key, those of older versions included, stay in the file,
+and their clips are judged again: the last line of a clip counts. A clip that cannot be read has an ERROR of its own.
+The exit code is 1 where a clip has an ERROR, or no clip at all has a reward.
 """
 
 import argparse

@@ -95,7 +95,8 @@ def test_without_planning_every_level_is_paid_and_voted_on_alike() -> None:
 def test_an_undone_task_is_paid_more_at_a_worse_level_and_alike_without_planning(
     plan: tuple[float, ...], paid: float
 ) -> None:
-    rewards = [judged(pack, planning=plan, task_completion=UNUSABLE)[0].reward for pack in ("robot", "robot_no_planning")]
+    undone = {"planning": plan, "task_completion": UNUSABLE}
+    rewards = [judged(pack, **undone)[0].reward for pack in ("robot", "robot_no_planning")]
     assert rewards == pytest.approx([paid, 0.30])
 
 

@@ -224,7 +224,7 @@ def test_a_number_that_is_not_finite_is_an_error_and_pays_nothing(
 ) -> None:
     def spoiled(*given: Any) -> tuple[dict[str, float], dict[str, float]]:
         made = model_numbers(*given)
-        made[part].update({name: value for name in made[part]})
+        made[part].update(dict.fromkeys(made[part], value))
         return made
 
     monkeypatch.setattr(one_class, "model_numbers", spoiled)

@@ -18,9 +18,9 @@ SAID = {"pass": 4, "fail": 1}
 
 
 class HumanJudge:
-    """Answers from exported labels, by the content of a clip, in whatever order the files come. It abstains where nobody
-    was sure, or as many say that a component passes as say that it fails. Raises AuditError: one person labelled an
-    evaluation twice.
+    """Answers from exported labels, by the content of a clip, in whatever order the files come. It abstains where
+    nobody was sure, or as many say that a component passes as say that it fails. Raises AuditError: one person labelled
+    an evaluation twice.
     """
 
     def __init__(self, files: Sequence[HumanLabels]) -> None:
