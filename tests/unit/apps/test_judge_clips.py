@@ -54,6 +54,33 @@ def test_a_servers_verdicts_are_kept_audited_and_gone_on_with(
     ]
 
 
+def test_another_question_is_asked_anew_and_a_verdict_of_before_is_kept_beside_it(tmp_path: Path) -> None:
+    (first, second) = write_clips(tmp_path)
+    cv2.imwrite(str(tmp_path / "end.png"), np.full((96, 96, 3), 90, np.uint8))
+    with serving(PickyServer()) as server, serving(PickyServer()) as other:
+        command = ["judge-clips", str(tmp_path), "--judge", server.url, "--judge-model", "judge"]
+        assert main(command) == 0
+
+        def asked(*more: str, **changed: Any) -> list[str]:
+            """Which clips are judged again with other fields of the second one."""
+            lines = [json.dumps(line) + "\n" for line in (first, {**second, **changed})]
+            (tmp_path / "clips.jsonl").write_text("".join(lines))
+            known = len(rows_of(tmp_path))
+            assert main([*command, *more]) == 0
+            return [row["clip_id"] for row in rows_of(tmp_path)[known:]]
+
+        assert asked() == [] and asked(reference="end.png") == asked(goal="end.png") == asked(robot="xarm") == ["mine"]
+        for settings in (
+            ["--judge.extra_body", "{top_k: 3}"], ["--judge.max_images", "50"], ["--judge", other.url],
+            ["--judge.max_reads", "50"], ["--judge.rubric", "robot_no_votes"], ["--judge.mode", "benchmark"],
+        ):
+            assert asked(*settings) == ["a", "mine"] and asked(*settings) == [], settings
+        assert asked("--judge.concurrency", "1", "--judge.tries", "9") == asked(goal="end.png") == []
+        old = [{**row, "key": f"{second['sha256']}  {second['instruction']}"} for row in rows_of(tmp_path)[:2]]
+        (tmp_path / VERDICTS).write_text("".join(json.dumps(row) + "\n" for row in old))
+        assert asked() == ["a", "mine"] and rows_of(tmp_path)[:2] == old, "of a version with another key"
+
+
 class EchoingServer(PickyServer):
     """Cites the key that it was sent, its / escaped as JSON allows, in every evidence."""
 

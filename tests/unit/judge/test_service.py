@@ -1,5 +1,6 @@
 """Many clips through the reward agent from plain threads: order, places, deadlines, stops; and its settings."""
 
+import asyncio
 import json
 import re
 import time
@@ -8,13 +9,14 @@ from contextlib import closing
 from dataclasses import replace
 from itertools import count, groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from deadlines import PATIENCE_S
+from deadlines import PATIENCE_S, within
 from graph.video_loop import write_contexts
-from judge_server import PickyServer
+from judge_server import PickyServer, serving
 from recording_samples import make_spec
 from rl_toys import toy_policy, toy_ppo, toy_rollout
 from scripted_judge import make_clip, make_task
@@ -101,6 +103,21 @@ def test_clips_without_a_verdict_by_the_deadline_say_so_and_have_no_reward(serve
         assert judge.tally.by_status == {Status.ERROR: 3} and judge.tally.invalid_rate == 1
     assert all(np.isnan(verdict.reward) for verdict in verdicts)
     assert {verdict.reason for verdict in verdicts} == {"no verdict by the round's deadline"}
+
+
+def test_a_clip_that_the_deadline_cuts_costs_what_was_answered_and_is_audited(tmp_path: Path) -> None:
+    class Tiring(PickyServer):
+        async def _answer(self, writer: asyncio.StreamWriter, body: dict[str, Any]) -> None:
+            self.delay_s = 30.0 if len(self.requests) > 2 else 0.0
+            await super()._answer(writer, body)
+
+    with serving(Tiring()) as server, closing(JudgeService(settings(server), seed=0, audit=tmp_path)) as judge:
+        (verdict,) = judge.judge(jobs(1), within_s=within(1.0))
+        assert verdict.status is Status.ERROR and verdict.reason == "no verdict by the round's deadline"
+        assert verdict.cost.calls == 2 and verdict.cost.prompt_tokens > 0 and verdict.num_reads > 2
+        assert judge.tally.cost == verdict.cost
+    (evaluation,) = read_record(tmp_path).judged()
+    assert evaluation.verdict.audit_id == verdict.audit_id
 
 
 def test_answers_that_were_kept_give_the_same_verdicts_without_a_server(server: PickyServer, tmp_path: Path) -> None:

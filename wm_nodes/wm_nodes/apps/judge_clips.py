@@ -7,15 +7,17 @@ A line of clips.jsonl: {"file": "a.mp4", "instruction": "push the red bar away f
 "push"}; also clip_id, robot, fps (of a .npy), reference (the picture that the clip had to start from), goal, and
 sha256, which is checked.
 Verdicts are appended to CLIPS/verdicts.jsonl (`accepted`: whether the clip is a success; null where the judge cannot
-tell); started again, it goes on with the clips that this judge, rubric and mode have not judged. A clip that cannot be
-read has an ERROR of its own. The exit code is 1 where a clip has an ERROR, or no clip at all has a reward.
+tell); started again, it goes on with the clips that were not judged by this judge, under these settings, with this task
+and these pictures (`key`, their hash). Verdicts with another key, those of older versions included, stay in the file,
+and their clips are judged again: the last line of a clip counts. A clip that cannot be read has an ERROR of its own.
+The exit code is 1 where a clip has an ERROR, or no clip at all has a reward.
 """
 
 import argparse
 import json
 import sys
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from statistics import fmean
@@ -24,13 +26,19 @@ from typing import Any
 from wm_nodes.apps.options import add_device, add_json, add_judge, device_settings, judge_settings
 from wm_nodes.config.load import judge_or_embedded, load_config
 from wm_nodes.core.progress import tqdm
-from wm_nodes.judge.agent.types import Status
+from wm_nodes.judge.agent.types import Status, media_sha
 from wm_nodes.judge.agent.verdict import Verdict
+from wm_nodes.judge.backends.calls import sha_of
 from wm_nodes.judge.clip_files import AT_ONCE, read_job, read_list
 from wm_nodes.judge.decisions import accepts
 from wm_nodes.judge.service import ClipJob, JudgeService
 
 VERDICTS = "verdicts.jsonl"
+CHANGES_NO_ANSWER = {
+    "folder", "api_key_env", "robot", "concurrency", "max_in_flight", "clip_budget_s", "tries", "json_timeout_s",
+    "label_timeout_s", "repeat_share", "keep_reads",
+}
+"""Settings that may be others in a verdict that is kept. An embedded judge's identity says what is in its folder."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -66,13 +74,16 @@ def run(arguments: argparse.Namespace) -> int:
         written.seek(0)
         before = written.read()
         written.write("" if before.endswith("\n") or not before else "\n")  # after a line that a crash has torn
-        done = _judged_before(before, by, {*judges.values()})
+        asked = {task: [judge_id, by, settings.model_dump(mode="json", exclude=CHANGES_NO_ANSWER)]
+                 for task, judge_id in judges.items()}
+        done = _judged_before(before)
         rows, waiting = list[dict[str, Any]](), list[ClipJob]()
         progress = tqdm(total=len(lines), desc="judged", unit="clip", disable=None)
 
         def flush() -> None:
             for job, verdict in zip(waiting, judge.judge(waiting, round_number=arguments.round), strict=True):
-                rows.append(_row(job, verdict, by | {"judge_id": judges[job.task.task_id]}))
+                task = job.task.task_id
+                rows.append({"key": _key(job, asked[task]), **_row(job, verdict), **by, "judge_id": judges[task]})
                 written.write(json.dumps(rows[-1]) + "\n")
             written.flush()
             progress.update(len(waiting))
@@ -80,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         with progress:
             for job in (read_job(arguments.clips, line) for line in lines):
-                if (known := done.get((_key(job), judges[job.task.task_id]))) is not None:
+                if (known := done.get(_key(job, asked[job.task.task_id]))) is not None:
                     rows.append(known)
                     progress.update()
                     continue
@@ -95,34 +106,33 @@ def run(arguments: argparse.Namespace) -> int:
     return int(unpaid or any(row["status"] == Status.ERROR for row in rows))
 
 
-def _key(job: ClipJob) -> str:
-    return f"{job.clip.sha256} {job.task.task_id} {job.task.instruction}"
+def _key(job: ClipJob, asked: list[Any]) -> str:
+    """SHA-256 of a clip and of all that its answers hang on."""
+    task, fps = job.task, job.clip.fps
+    pictures = [None if one is None else media_sha(one, fps) for one in (task.reference_frame, task.goal_image)]
+    return sha_of([job.clip.sha256, task.task_id, task.instruction, task.robot, pictures, asked])
 
 
-def _row(job: ClipJob, verdict: Verdict, by: dict[str, Any]) -> dict[str, Any]:
+def _row(job: ClipJob, verdict: Verdict) -> dict[str, Any]:
     return {
-        "clip_id": job.clip.clip_id, "key": _key(job), "status": str(verdict.status),
+        "clip_id": job.clip.clip_id, "status": str(verdict.status),
         "reward": verdict.reward if verdict.valid else None, "accepted": accepts(verdict), "level": verdict.level,
         "stages": {str(s.stage): s.s for s in verdict.stages if s.status is Status.OK},
         "hacks": [flag.pattern for flag in verdict.hack_flags if flag.confirmed],
-        "reason": verdict.reason, "audit_id": verdict.audit_id, **by,
+        "reason": verdict.reason, "audit_id": verdict.audit_id,
     }
 
 
-def _judged_before(
-    written: str, by: dict[str, Any], judges: Collection[str]
-) -> dict[tuple[str, str], dict[str, Any]]:
-    """Rows by clip with its task, and judge, that were asked alike; an ERROR is asked again, a torn line is passed
-    over."""
-    found = dict[tuple[str, str], dict[str, Any]]()
+def _judged_before(written: str) -> dict[str, dict[str, Any]]:
+    """Rows by key; an ERROR is asked again, a torn line is passed over."""
+    found = dict[str, dict[str, Any]]()
     for text in written.removeprefix("\ufeff").split("\n"):
         try:
             row = json.loads(text)
         except ValueError:
             continue
-        asked = {name: row.get(name) for name in by} == by and row.get("judge_id") in judges
-        if asked and row.get("status") != Status.ERROR:
-            found[row["key"], row["judge_id"]] = row
+        if row.get("status") != Status.ERROR:
+            found[row.get("key", "")] = row
     return found
 
 

@@ -29,7 +29,8 @@ def row_names(rubric: Rubric) -> list[str]:
     names = [PLANNING]
     for stage in (stage for stage in STAGES if stage in rubric.stages):
         names += [str(stage), *rubric.stages[stage].components]
-    return [*names, *rubric.stages[Stage.TC].components, OVERALL]
+    completion = rubric.stages[Stage.TC].components if Stage.TC in rubric.stages else ()
+    return [*names, *completion, OVERALL]
 
 
 def stage_labels(components: Mapping[str, bool | int | None], rubric: Rubric) -> dict[str, bool | None]:
@@ -75,7 +76,8 @@ def decisions_of(verdict: Verdict) -> dict[str, Decision]:
 def accepts(verdict: Verdict) -> bool | None:
     """Whether a trainer would take the clip for a success; None where the verdict has no number.
 
-    A failed gate means False, even if later stages abstained.
+    A failed gate means False, even if later stages abstained. Where none failed, every stage of the rubric was read, as
+    scoring.reward demands of a number; PRECHECK alone gives one without any stage.
     """
     if verdict.status is Status.ERROR:
         return None
@@ -83,4 +85,4 @@ def accepts(verdict: Verdict) -> bool | None:
     completion = [score for stage in read for score in stage.components if score.component == TASK_COMPLETION]
     if any(not stage.passed for stage in read) or any(not score.passed for score in completion):
         return False
-    return len(read) == len(verdict.stages) if verdict.status is Status.OK else None
+    return bool(read) if verdict.status is Status.OK else None

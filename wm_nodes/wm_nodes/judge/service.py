@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import suppress
+from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import CPU
 from wm_nodes.core.named_files import RUBRIC, NamedFiles
 from wm_nodes.judge.agent.judge import Cost, Health
-from wm_nodes.judge.agent.machine import RewardAgent
+from wm_nodes.judge.agent.machine import OUT_OF_ROUND, RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.scoring import skipped_stage
 from wm_nodes.judge.agent.types import GATED, ClipRef, Status, TaskSpec, clip_ref
@@ -270,14 +270,16 @@ class JudgeService:
         return verdict
 
     async def _evaluate(self, agent: RewardAgent, job: ClipJob, deadline: float | None) -> Verdict:
-        left_s = None if deadline is None else deadline - time.monotonic()
-        try:
-            async with asyncio.timeout(left_s), self._semaphore:
-                known = self._evidence
-                evidence = {} if known is None else await asyncio.to_thread(known.evidence, job.clip, job.task)
-                return await agent.evaluate(job.clip, job.task, evidence)
-        except TimeoutError:
-            return _unjudged(agent, job, "no verdict by the round's deadline")
+        deadline = math.inf if deadline is None else deadline
+        async with AsyncExitStack() as place:
+            try:
+                async with asyncio.timeout(deadline - time.monotonic()):
+                    await place.enter_async_context(self._semaphore)
+                    known = self._evidence
+                    evidence = {} if known is None else await asyncio.to_thread(known.evidence, job.clip, job.task)
+            except TimeoutError:
+                return _unjudged(agent, job, OUT_OF_ROUND)
+            return await agent.evaluate(job.clip, job.task, evidence, within_s=deadline - time.monotonic())
 
     async def _ask_health(self, slot: _JudgeSlot) -> None:
         self.health = await slot.opened.judge.health()

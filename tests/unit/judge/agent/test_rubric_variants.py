@@ -3,6 +3,7 @@
 import asyncio
 from typing import Any
 
+import numpy as np
 import pytest
 from scripted_judge import (
     BORDERLINE,
@@ -11,6 +12,7 @@ from scripted_judge import (
     GOOD,
     POOR,
     UNUSABLE,
+    WRONG,
     ScriptedJudge,
     clean_table,
     make_clip,
@@ -20,8 +22,9 @@ from scripted_judge import (
 from wm_nodes.config.load import ConfigError
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import load_rubric
-from wm_nodes.judge.agent.types import Stage, Status
+from wm_nodes.judge.agent.types import Stage, Status, clip_ref
 from wm_nodes.judge.agent.verdict import Verdict
+from wm_nodes.judge.decisions import OVERALL, Decision, accepts, decisions_of
 
 VARIANTS = [
     f"robot_{name}" for name in (
@@ -44,9 +47,19 @@ def judged(pack: str, mode: Any = "reward", **table: Any) -> tuple[Verdict, list
 
 @pytest.mark.parametrize("pack", VARIANTS)
 @pytest.mark.parametrize("plan", [GOOD, FAIR, POOR])
-def test_a_clean_clip_still_earns_one(pack: str, plan: tuple[float, ...]) -> None:
+def test_a_clean_clip_still_earns_one_and_is_a_success(pack: str, plan: tuple[float, ...]) -> None:
     verdict, _ = judged(pack, planning=plan)
     assert verdict.status is Status.OK and verdict.reward == pytest.approx(1)
+    assert accepts(verdict) is True and decisions_of(verdict)[OVERALL] == Decision(True, 1.0)
+
+
+@pytest.mark.parametrize("pack", VARIANTS)
+def test_a_clip_that_fails_a_gate_or_the_task_or_shows_nothing_is_no_success(pack: str) -> None:
+    for failed in ({"robot": UNUSABLE}, {"task_completion": WRONG}, {"objective": UNUSABLE, "temporal": UNUSABLE}):
+        assert accepts(judged(pack, **failed)[0]) is False
+    black = clip_ref("black", np.zeros_like(make_clip().frames), 8.0)
+    agent = RewardAgent(ScriptedJudge(clean_table(ROBOT)), load_rubric(pack))
+    assert accepts(asyncio.run(agent.evaluate(black, make_task(black)))) is False
 
 
 @pytest.mark.parametrize("mode", ["reward", "benchmark"])
@@ -76,6 +89,15 @@ def test_without_planning_every_level_is_paid_and_voted_on_alike() -> None:
     assert len(rewards) == len(reads) == 1
     assert rewards == {judged("robot", planning=GOOD, clarity=DOUBT)[0].reward}
     assert judged("robot", planning=POOR, clarity=DOUBT)[0].reward not in rewards
+
+
+@pytest.mark.parametrize(("plan", "paid"), [(POOR, 0.80), (FAIR, 0.55), (GOOD, 0.30)])
+def test_an_undone_task_is_paid_more_at_a_worse_level_and_alike_without_planning(
+    plan: tuple[float, ...], paid: float
+) -> None:
+    undone = {"planning": plan, "task_completion": UNUSABLE}
+    rewards = [judged(pack, **undone)[0].reward for pack in ("robot", "robot_no_planning")]
+    assert rewards == pytest.approx([paid, 0.30])
 
 
 def test_with_single_reads_the_first_answer_decides() -> None:

@@ -4,6 +4,7 @@ import asyncio
 import json
 import math
 from collections.abc import Mapping
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -133,29 +134,47 @@ def everything(**changed: Any) -> dict[str, Any]:
     return dict.fromkeys(names, True) | {"planning": 3} | changed
 
 
-def test_people_are_a_judge_whose_votes_are_persons(tmp_path: Path) -> None:
+def test_people_are_a_judge_that_everybody_who_is_sure_votes_in(tmp_path: Path) -> None:
     evaluations = judged(tmp_path / "log", [{}, {}])
     said = [write_labels(tmp_path / f"{who}.json", evaluations, rows, who) for who, rows in (
-        ("Ada", [everything(clarity=False), everything(clarity=None)]),
-        ("Bob", [everything(), everything()]),
-        ("Cleo", [everything(clarity=False), everything(clarity=True)]),
+        ("Ada", [everything(clarity=False), everything(clarity=None, color=False)]),
+        ("Bob", [everything(planning=2), everything()]),
+        ("Cleo", [everything(clarity=False), everything(clarity=True, color=None)]),
     )]
     judge, (first, second) = HumanJudge([read_labels(path) for path in said]), clips(2)
     assert judge.capabilities.judge_id.startswith("human:") and "Ada, Bob, Cleo" in judge.capabilities.card
 
-    def votes(job: Job, stage: Stage, *names: str) -> list[Read]:
-        asked = tuple(next_vote(j, 0) for j in range(3))
-        return asyncio.run(judge.read(ReadRequest(*job, stage, names, Profile.S, asked, ())))
+    def read(job: Job, stage: Stage, name: str) -> Read:
+        reads = asyncio.run(judge.read(ReadRequest(*job, stage, (name,), Profile.S, (next_vote(1, 0),), ())))
+        return reads[0]
 
-    assert [read.levels for read in votes(first, Stage.VQ, "clarity")] == [WRONG, CLEAN, WRONG]
-    assert [read.levels for read in votes(second, Stage.VQ, "clarity")] == [CLEAN] * 3  # Bob, Cleo, Bob: Ada is unsure
-    assert votes(first, Stage.PLAN, "planning")[0].focus == ("clarity",)
-    (silent, *_) = votes(first, Stage.PC, "liquid")
+    assert read(first, Stage.VQ, "clarity").levels == pytest.approx((0, 2 / 3, 0, 0, 1 / 3))
+    assert read(first, Stage.VQ, "clarity").evidence_text == "2 of 3 votes"
+    assert read(second, Stage.VQ, "clarity").levels == CLEAN  # Ada is unsure
+    split, silent = read(second, Stage.VQ, "color"), read(first, Stage.PC, "liquid")
+    assert split.status is Status.ABSTAIN and "1 votes pass, 1 fail" in split.reason
     assert silent.status is Status.ABSTAIN and silent.reason == "nobody labelled liquid"
-    agent = RewardAgent(judge, load_rubric("robot", {"voting": {"audit_share": 1.0}}), mode="benchmark")
-    verdict = asyncio.run(agent.evaluate(*first))
+    plan = read(first, Stage.PLAN, "planning")
+    assert plan.focus == ("clarity",) and plan.levels == pytest.approx((0, 0, 1 / 3, 2 / 3))
+    verdict = asyncio.run(RewardAgent(judge, RUBRIC, mode="benchmark").evaluate(*first))
     (clarity,) = [score for score in verdict.stages[0].components if score.component == "clarity"]
-    assert not clarity.passed and clarity.decided_by == "2 of 3 votes"
+    assert not clarity.passed and clarity.p_fail == pytest.approx(2 / 3)
+
+
+def test_what_people_pay_does_not_hang_on_the_order_of_their_files(tmp_path: Path) -> None:
+    evaluations = judged(tmp_path / "log", [{}])
+    said = {
+        "Ada": everything(), "Bob": everything(planning=1, clarity=False, robot=False),
+        "Cleo": everything(robot=False, **{"hack: occlusion": False}),
+    }
+    files = [read_labels(write_labels(tmp_path / f"{n}.json", evaluations, [rows], n)) for n, rows in said.items()]
+    rubrics = [load_rubric("robot", {"voting": {"audit_share": share}}) for share in (0.0, 1.0)]
+    for number in (2, 3):
+        for rubric in rubrics:
+            agents = [RewardAgent(HumanJudge(order), rubric) for order in permutations(files[:number])]
+            verdicts = [asyncio.run(agent.evaluate(*clips(1)[0])) for agent in agents]
+            assert len({verdict.audit_id for verdict in verdicts}) == 1
+            assert verdicts[0].valid == (number == 3), "two people who differ pay nothing"
 
 
 def test_the_command_names_the_clips_that_are_paid_more_than_people_would(

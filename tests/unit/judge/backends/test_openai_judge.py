@@ -414,6 +414,25 @@ def test_budget_ends_the_calls_of_a_request() -> None:
         reads_of(request(), ChatServer(delay_s=1), settings=asked_by(clip_budget_s=0.2))
 
 
+def test_a_pattern_read_by_letters_is_confirmed_by_letters_in_another_order() -> None:
+    class NoJsonOfPatterns(ChatServer):
+        def _completion(self, body: dict[str, Any], fault: Fault | None) -> str:
+            refused = body.get("response_format", {}).get("json_schema", {}).get("name") == "hack"
+            return super()._completion(body, Fault("reply", text="no") if refused else fault)
+
+    async def steps(judge: OpenAIJudge) -> Verdict:
+        return await RewardAgent(judge, load_rubric("robot_single_read"), call_plan="pack").evaluate(CLIP, TASK)
+
+    server = NoJsonOfPatterns(labels={"A": 1.0})  # the first letter, whatever it stands for
+    verdict: Verdict = judging(steps, server)
+    asked = [json.dumps(body, sort_keys=True) for body in server.requests if "logprobs" in body]
+    assert len(asked) == len(set(asked)) == 8, "four patterns, each asked about in two ways"
+    orders = {flag.pattern: option_order(next_vote(2, 0), CLIP.sha256, flag.pattern) for flag in verdict.hack_flags}
+    assert all(flag.p_present == 1 for flag in verdict.hack_flags)
+    assert [flag.confirmed for flag in verdict.hack_flags] == [order[0] < 2 for order in orders.values()]
+    assert not all(flag.confirmed for flag in verdict.hack_flags)
+
+
 # Label reads
 
 

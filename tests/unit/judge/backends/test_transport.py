@@ -18,6 +18,7 @@ from deadlines import within
 
 from wm_nodes.core.imports import MissingPackageError
 from wm_nodes.judge.backends.answer_limit import ANSWER_BYTES
+from wm_nodes.judge.backends.labels import option_probabilities
 from wm_nodes.judge.backends.limits import AdaptiveLimit, Admission, CircuitBreaker
 from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy, TransportError, retry_after_s
 
@@ -277,7 +278,7 @@ def test_a_compressed_answer_which_could_grow_is_no_answer() -> None:
     assert server.headers[0]["accept-encoding"] == "identity"
 
 
-@pytest.mark.parametrize("key", ["a/b+c=d/e", 'quo"te\\back', "it's", "<&>", "%2F%", "[0-9]+"])
+@pytest.mark.parametrize("key", ["a/b+c=d/e", 'quo"te\\back', "it's_mine", "<&><&><&>", "%2F%2f%2F", "[0-9]+[a-z]+"])
 def test_a_key_is_found_however_it_is_written(key: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WM_TEST_KEY", key)
     escaped = json.dumps(key)[1:-1].replace("/", "\\/")
@@ -296,6 +297,24 @@ def test_a_key_is_found_however_it_is_written(key: str, monkeypatch: pytest.Monk
         with pytest.raises(TransportError) as caught:
             await transport.complete(BODY, timeout_s=20)
         assert key[:2] not in str(caught.value).partition("x" * 400)[2].rstrip("'}")
+
+    talk(steps, server, api_key_env="WM_TEST_KEY")
+
+
+@pytest.mark.parametrize("key", ["none", "token", "null", "pw", "[0-9]+"])
+def test_a_short_key_changes_no_answer_and_stands_in_no_error(key: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WM_TEST_KEY", key)
+    said = '{"visible_problems": ["none"], "summary": "tokens [0-9]+"}'
+    server = ChatServer(labels={"A": 1.0})
+    server.faults.extend([Fault("reply", text=said), Fault("status", 401, f"wrong key <{key}>")])
+
+    async def steps(transport: ChatTransport, server: ChatServer) -> None:
+        answer = await ask_patiently(transport, server)
+        assert answer.completion.choices[0].message.content == said and answer.completion.usage.prompt_tokens > 0
+        with pytest.raises(TransportError, match=r"<\[WM_TEST_KEY\]>"):
+            await ask_patiently(transport, server)
+        letters = await transport.complete({**BODY, "logprobs": True}, timeout_s=20)
+        assert option_probabilities(letters.completion, "AB") == ((1.0, 0.0), 1.0)
 
     talk(steps, server, api_key_env="WM_TEST_KEY")
 

@@ -3,10 +3,12 @@
 import asyncio
 import functools
 import json
+import math
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,12 +24,14 @@ from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.agent.types import ClipRef, Profile, Stage, Status, TaskSpec, clip_ref
 from wm_nodes.judge.agent.verdict import Verdict
+from wm_nodes.judge.backends import one_class
 from wm_nodes.judge.backends.factory import check_judge, make_judge
 from wm_nodes.judge.backends.one_class import OneClassJudge, ranges_of, unfit_reason
 from wm_nodes.judge.check_set import LabelledClip, load_check_set
 from wm_nodes.judge.one_class.calibration import words_of
+from wm_nodes.judge.one_class.imagination import model_numbers
 from wm_nodes.judge.one_class.pictures import HUES
-from wm_nodes.judge.one_class.ranges import KEPT, file_of, load_ranges, strides_of
+from wm_nodes.judge.one_class.ranges import KEPT, file_of, load_ranges, save_ranges, strides_of
 from wm_nodes.world_model.folder import read_world_manifest
 
 FOLDER = shipped_model("push_cube")
@@ -201,6 +205,33 @@ def test_a_folder_without_ranges_or_with_those_of_another_model_is_refused_with_
         OneClassJudge(folder)
     for refused in (other, none):
         assert f"wm judge calibrate {folder} BAG --stride 1" in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_other_ranges_of_any_stride_are_another_judge(tmp_path: Path) -> None:
+    folder, names = tmp_path / "model", {judge().name}
+    shutil.copytree(FOLDER, folder, ignore=shutil.ignore_patterns("video_model*"))
+    assert len(strides_of(folder)) > 1 and OneClassJudge(folder).name in names
+    for stride in strides_of(folder):
+        save_ranges(folder, replace(load_ranges(folder, stride), height_m=0.5))
+        names.add(OneClassJudge(folder).name)
+    assert len(names) == 1 + len(strides_of(folder))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("part", [0, 1], ids=["number", "done"])
+def test_a_number_that_is_not_finite_is_an_error_and_pays_nothing(
+    monkeypatch: pytest.MonkeyPatch, value: float, part: int
+) -> None:
+    def spoiled(*given: Any) -> tuple[dict[str, float], dict[str, float]]:
+        made = model_numbers(*given)
+        made[part].update(dict.fromkeys(made[part], value))
+        return made
+
+    monkeypatch.setattr(one_class, "model_numbers", spoiled)
+    agent = RewardAgent(OneClassJudge(FOLDER), load_rubric("robot"))
+    verdict = asyncio.run(agent.evaluate(clean().job.clip, clean().job.task))
+    assert verdict.status is Status.ERROR and math.isnan(verdict.reward) and "is not finite" in verdict.reason
+    assert OneClassJudge(FOLDER).evidence(clean().job.clip, clean().job.task) == {}
 
 
 @pytest.mark.parametrize("task", ["push_cube", "reach", "move_to_aim", "pick_place", "pull", "push", "reach_object"])

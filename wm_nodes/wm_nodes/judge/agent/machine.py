@@ -47,6 +47,7 @@ from wm_nodes.judge.agent.verdict import (
 
 Mode = Literal["reward", "benchmark", "topreward"]
 CallPlan = Literal["pack", "fanout", "auto"]
+OUT_OF_ROUND = "no verdict by the round's deadline"
 
 
 class RewardAgent:
@@ -88,17 +89,20 @@ class RewardAgent:
         """Of the words that the judge is asked in: the rubric's, or that of mode topreward."""
         return topreward.VERSION if self.mode == topreward.MODE else self.rubric.version
 
-    async def evaluate(self, clip: ClipRef, task: TaskSpec, evidence: Evidence | None = None) -> Verdict:
-        """Judge one clip. evidence: causes votes and second looks, nothing else."""
+    async def evaluate(
+        self, clip: ClipRef, task: TaskSpec, evidence: Evidence | None = None, *, within_s: float = math.inf
+    ) -> Verdict:
+        """Judge one clip. evidence: causes votes and second looks, nothing else. within_s: what its round has left."""
         started, clock = time.time(), time.monotonic()
         run = _Run(self, clip, task, evidence or {})
         try:
-            async with asyncio.timeout(self.budget_s):
+            async with asyncio.timeout(min(self.budget_s, within_s)):
                 status, value, reason = await run.judge_clip()
         except _Stop as stop:
             status, value, reason = stop.status, math.nan, str(stop)
         except TimeoutError:
-            status, value, reason = Status.ERROR, math.nan, f"no verdict within {self.budget_s:g} s"
+            reason = OUT_OF_ROUND if within_s < self.budget_s else f"no verdict within {self.budget_s:g} s"
+            status, value = Status.ERROR, math.nan
         able = self.judge.capabilities
         verdict = Verdict(
             clip_id=clip.clip_id,
@@ -282,14 +286,17 @@ class _Run:
             raise _Stop(Status.ERROR, f"no JSON answer was accepted, and letters alone are no judgement: {why}")
 
     async def _read_patterns(self) -> None:
-        """Read every hacking pattern once, and those that seem present again."""
+        """Read every hacking pattern once, and those that seem present again, which must be another question.
+
+        Where the first reads are letters, JSON being refused, they asked for defects worst first, as vote 1 does.
+        """
         rules, names = self.rubric.hack, tuple(self.rubric.hack.patterns)
         if not names:
             return
         first = await self._ask(Stage.HACK, names, levels.first_vote(self.agent.seed), Profile.D)
         present = {read.component: self._p_present(read) for read in first}
         seen = tuple(name for name in names if present[name] >= rules.confirm)
-        vote = levels.next_vote(1, self.agent.seed)
+        vote = levels.next_vote(2 if any(read.source == "label" for read in first) else 1, self.agent.seed)
         again = await self._ask(Stage.HACK, seen, vote, Profile.D) if seen else []
         confirmed = {read.component for read in again if self._p_present(read) >= rules.confirm}
         texts = {read.component: read.evidence_text for read in first}

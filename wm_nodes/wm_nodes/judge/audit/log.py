@@ -26,6 +26,7 @@ LOCK_NAME = "lock"
 NO_LINE = "0" * 64
 """What line 1 follows."""
 MIN_SECRET = 8
+"""Characters of the shortest key that is looked for in texts; a shorter one may be a word of theirs."""
 _SECRET_NAME = re.compile(r"(^|_)(API_?KEY|KEY|TOKEN|SECRET|PASSWORD|PASSWD)($|_)", re.IGNORECASE)
 _SECRET_TEXT = re.compile(r"(?i:bearer\s+)[^\s\"']{8,}|\bsk-[A-Za-z0-9_-]{8,}")
 

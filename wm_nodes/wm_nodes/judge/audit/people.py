@@ -1,15 +1,15 @@
 """A judge that answers with people's labels, so that they go through the same states, gates and weights.
 
-A vote is one person's answer: where people differ, components are voted on, pooled or left undecided as the reads of a
-server are.
+A vote is one person's answer, and everybody who was sure votes: their answers are pooled, or left undecided, as the
+votes of a server are (RA-7, RA-8 with k the number of people). Every read is the outcome of that vote.
 """
 
 import hashlib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 
 from wm_nodes.judge.agent.judge import Capabilities, Health, Read, ReadRequest, Vote
-from wm_nodes.judge.agent.levels import one_hot
+from wm_nodes.judge.agent.levels import one_hot, pool, settle
 from wm_nodes.judge.agent.types import NUM_PLAN_LEVELS, PLANNING, Stage, Status
 from wm_nodes.judge.audit.labels import HACK, HumanLabels, RowLabel, annotators
 
@@ -18,17 +18,18 @@ SAID = {"pass": 4, "fail": 1}
 
 
 class HumanJudge:
-    """Answers from exported labels, by the content of a clip. Vote j is the answer of person j, counted round among
-    those who were sure; it abstains where nobody was. Raises AuditError: one person labelled an evaluation twice.
+    """Answers from exported labels, by the content of a clip, in whatever order the files come. It abstains where
+    nobody was sure, or as many say that a component passes as say that it fails. Raises AuditError: one person labelled
+    an evaluation twice.
     """
 
     def __init__(self, files: Sequence[HumanLabels]) -> None:
-        self._people = annotators(files)
+        self._people = sorted(annotators(files))
         self._said: dict[str, list[dict[str, RowLabel]]] = defaultdict(list)
         for file in files:
             for label in file.labels:
                 self._said[label.sha256].append(label.rows)
-        content = "".join(file.model_dump_json() for file in files)
+        content = "".join(sorted(file.model_dump_json() for file in files))
         self._sha = hashlib.sha256(content.encode()).hexdigest()[:12]
 
     @property
@@ -52,12 +53,25 @@ def _answer(component: str, row: str, vote: Vote, said: Sequence[dict[str, RowLa
     if not sure:
         reason = f"nobody was sure of {row}" if any(row in rows for rows in said) else f"nobody labelled {row}"
         return Read(component, (), "human", vote, status=Status.ABSTAIN, reason=reason)
-    rows = sure[vote.index % len(sure)]
-    label = rows[row]
-    if component != PLANNING:
-        return Read(component, one_hot(SAID[label.answer] if label.level is None else label.level), "human", vote)
-    if label.level is None or label.level >= NUM_PLAN_LEVELS:
-        reason = f"planning needs a level 0 to {NUM_PLAN_LEVELS - 1}, got {label.level}"
-        return Read(component, (), "human", vote, status=Status.ERROR, reason=reason)
-    failed = tuple(name for name, other in rows.items() if other.answer == "fail" and not name.startswith(HACK))
-    return Read(component, one_hot(label.level, NUM_PLAN_LEVELS), "human", vote, focus=failed)
+    if component == PLANNING:
+        return _planning(vote, sure)
+    labels = [rows[row] for rows in sure]
+    levels = [SAID[label.answer] if label.level is None else label.level for label in labels]
+    votes = [Read(component, one_hot(level), "human", vote) for level in levels]
+    voted = settle(votes, min_label_mass=0)
+    if voted.status is not Status.OK:
+        return Read(component, (), "human", vote, status=voted.status, reason=voted.reason)
+    return Read(component, pool(votes), "human", vote, evidence_text=voted.decided_by if len(votes) > 1 else "")
+
+
+def _planning(vote: Vote, sure: Sequence[dict[str, RowLabel]]) -> Read:
+    """The share of the people per level; what most of them see fail is looked at first."""
+    levels = [rows[PLANNING].level for rows in sure]
+    known = [one_hot(level, NUM_PLAN_LEVELS) for level in levels if level is not None and level < NUM_PLAN_LEVELS]
+    if len(known) < len(levels):
+        reason = f"planning needs a level 0 to {NUM_PLAN_LEVELS - 1}, got {', '.join(map(str, levels))}"
+        return Read(PLANNING, (), "human", vote, status=Status.ERROR, reason=reason)
+    failed = Counter(name for rows in sure for name, other in rows.items() if other.answer == "fail")
+    focus = sorted((name for name in failed if not name.startswith(HACK)), key=lambda name: (-failed[name], name))
+    pooled = pool([Read(PLANNING, level, "human", vote) for level in known])
+    return Read(PLANNING, pooled, "human", vote, focus=tuple(focus))

@@ -1,6 +1,7 @@
 """A reward agent that writes every question, answer and verdict into an audit log."""
 
 import asyncio
+import math
 from collections.abc import Mapping
 from contextvars import ContextVar
 from typing import Any
@@ -37,7 +38,9 @@ class AuditedAgent(RewardAgent):
             {"capabilities": plain(judge.capabilities), "rubric_version": rubric.version, "settings": plain(limits)},
         )
 
-    async def evaluate(self, clip: ClipRef, task: TaskSpec, evidence: Evidence | None = None) -> Verdict:
+    async def evaluate(
+        self, clip: ClipRef, task: TaskSpec, evidence: Evidence | None = None, *, within_s: float = math.inf
+    ) -> Verdict:
         """Judge one clip; the verdict is on the disk when this returns. Raises OSError: it cannot be written down."""
         if clip.sha256 not in self._written:
             self._log.append("clip", clip_body(clip, self._store))
@@ -48,7 +51,7 @@ class AuditedAgent(RewardAgent):
         })
         token = _EVALUATION.set(evaluation)
         try:
-            verdict = await super().evaluate(clip, task, evidence)
+            verdict = await super().evaluate(clip, task, evidence, within_s=within_s)
         finally:
             _EVALUATION.reset(token)
         self._log.append("verdict", {"evaluation": evaluation, "verdict": plain(verdict)}, sync=True)

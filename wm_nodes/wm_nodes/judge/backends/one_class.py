@@ -5,6 +5,7 @@ all votes of a component and the second read of a reflection get the same answer
 """
 
 import asyncio
+import hashlib
 import math
 import threading
 import time
@@ -110,8 +111,8 @@ class OneClassJudge:
 
     @cached_property
     def sha256(self) -> str:
-        """Of the ranges, which name the world model."""
-        return min(self._ranges.items())[1].sha256
+        """Of the ranges of every stride, which name the world model."""
+        return hashlib.sha256("".join(ranges.sha256 for ranges in self._ranges.values()).encode()).hexdigest()
 
     @property
     def name(self) -> str:
@@ -169,6 +170,7 @@ class OneClassJudge:
             return self._cache[key]
 
     def _measure(self, clip: ClipRef, task: TaskSpec) -> tuple[NormalRanges, Finding]:
+        """Raises ValueError: a number of the clip is not finite."""
         ranges = nearest_ranges(self._ranges, self._models.manifest, clip.fps)
         reason = unfit_reason(self._ranges, self._models.manifest, clip.frames.shape, clip.fps)
         if not reason and task.reference_frame.shape != clip.frames.shape[1:]:
@@ -181,7 +183,10 @@ class OneClassJudge:
         drawn, done = model_numbers(
             self._models, clip.frames, ranges.stride, origin, ranges.height_m, self._reader
         )
-        strange = ranges.strangeness(numbers | drawn)
+        numbers |= drawn
+        if lost := [name for name, value in (numbers | done).items() if not math.isfinite(value)]:
+            raise ValueError(f"{', '.join(lost)} of clip {clip.clip_id} is not finite; check the world model")
+        strange = ranges.strangeness(numbers)
         worst: dict[Component, tuple[float, str]] = {}
         for name, component in COMPONENTS.items():
             worst[component] = max(worst.get(component, (-math.inf, "")), (strange[name], name))

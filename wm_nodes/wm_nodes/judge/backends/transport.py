@@ -20,6 +20,7 @@ from urllib.parse import urlsplit
 from pydantic import ValidationError
 
 from wm_nodes.core.imports import optional_package
+from wm_nodes.judge.audit.log import MIN_SECRET
 from wm_nodes.judge.backends.limits import AdaptiveLimit, Admission, CircuitBreaker
 from wm_nodes.judge.backends.protocol import Completion
 
@@ -116,13 +117,19 @@ class _Server:
 
     def __init__(self, endpoint: Endpoint, client: Any, probe_s: float) -> None:
         self.endpoint, self.client = endpoint, client
-        self._key = _written_anyhow(endpoint.api_key()) if endpoint.api_key_env else None
+        key = endpoint.api_key() if endpoint.api_key_env else ""
+        self._key, self._is_key_unique = _written_anyhow(key) if key else None, len(key) >= MIN_SECRET
         self.limit = AdaptiveLimit(endpoint.max_in_flight)
         self.breaker = CircuitBreaker(time.monotonic, probe_s=probe_s)
 
     def clean(self, text: str) -> str:
-        """The text without the key: servers repeat headers in their error messages, and some in their answers."""
+        """The text without the key: servers repeat headers in their error messages."""
         return self._key.sub(f"[{self.endpoint.api_key_env}]", text) if self._key else text
+
+    def clean_answer(self, body: str) -> str:
+        """The body without the key, which some servers repeat, too. One like `none` or `token` may be any word of an
+        answer, and stays."""
+        return self.clean(body) if self._is_key_unique else body
 
 
 class ChatTransport:
@@ -264,7 +271,7 @@ class ChatTransport:
                     messages=body["messages"],
                     extra_body={key: value for key, value in body.items() if key != "messages"},
                 )
-            return Completion.model_validate_json(server.clean(raw.http_response.text))
+            return Completion.model_validate_json(server.clean_answer(raw.http_response.text))
         except (TimeoutError, openai.APITimeoutError):
             text = f"no answer within {allowed_s:.1f} s"
             if cut_short:
