@@ -6,6 +6,7 @@ from statistics import fmean
 from typing import get_args
 
 from benchmarks.environments.clones import TASKS as CLONED
+from benchmarks.environments.replays import of_split
 from benchmarks.environments.reward_test import shown
 from benchmarks.environments.roboscape import (
     ALL_SCENES,
@@ -114,6 +115,12 @@ def rewards() -> Rows:
             *("/".join(shown(of[domain][name], form) for domain in splits())
               for name, form in (("auroc_empty_hand", ".2f"), ("rank_correlation", "+.2f"))),
         )
+
+
+def replays() -> Rows:
+    for row in read("roboscape_replays.json")["rows"]:
+        places = "simulator's" if row["config"]["simulation"]["object_state"] == "truth" else "read off pictures"
+        yield row["task"], row["seed"], LABELS[row["model"]], places, *map(of_split, row["replays"].values())
 
 
 def ppo_settings() -> Rows:
