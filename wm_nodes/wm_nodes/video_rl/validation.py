@@ -23,6 +23,7 @@ from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts, sample_by
 from wm_nodes.world_model.position_probe import PositionProbe
 
 OUTCOMES = ("success", "outcome", *EXECUTION_SCORES)
+"""How a clip ends. With given actions it should end as its recording did, so that more is not better."""
 
 HeldoutScores = Callable[[], Mapping[str, float]]
 """The held-out scores of a network's weights at the moment of the call."""
