@@ -242,6 +242,14 @@ def test_the_paper_s_preset_is_its_table_5() -> None:
         ({"rollout.samplr.eta": 0.5}, "unknown setting 'rollout.samplr'"),
         ({"grpo.learning_rate": "fast"}, "grpo.learning_rate"),
         ({"rollout.sampler.mask.m_min": 0}, r"m_min.*greater than 0 \(got 0\)"),
+        (
+            {"rollout.sampler.arm": "ode", "grpo.objective": "nft", "grpo.kl.beta": 0, "groups.shared_noise": True},
+            r"rollout\.sampler\.arm ode.*the same; set groups\.shared_noise false",
+        ),
+        (
+            {"rollout.sampler.eta": 0, "grpo.objective": "nft", "grpo.kl.beta": 0, "groups.shared_noise": True},
+            r"eta 0.*the same; set groups\.shared_noise false",
+        ),
         ({"task": "fly"}, r"task.*push_cube.*'fly'"),
         ({"evaluation.window": 2}, r"evaluation\.window.*greater than or equal to 3 \(got 2\)"),
     ],

@@ -226,7 +226,8 @@ def _condition(folder: VideoFolder, contexts: Clips, config: VideoRlConfig) -> C
 
 
 def _ode(config: VideoRlConfig, num_steps: int) -> RolloutConfig:
-    return config.rollout.with_values(num_steps=num_steps, buffer_device="model")
+    sampler = config.rollout.sampler.with_values(arm="ode")
+    return config.rollout.with_values(num_steps=num_steps, sampler=sampler, buffer_device="model")
 
 
 def _seeds(seed: int, name: str, iteration: int, group: Tensor, sample: Tensor) -> Tensor:
