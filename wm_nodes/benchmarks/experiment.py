@@ -108,9 +108,9 @@ class Experiment:
         if self.json is None:
             return
         facts = {"command": self.command, "machine": machine_facts(device), "date": time.strftime("%Y-%m-%d")}
-        text = json.dumps(plain({**results, **facts}))
-        written = json.loads(text, parse_float=float if exact else lambda digits: float(f"{float(digits):.5g}"))
-        write_atomic(self.json, (json.dumps(written, indent=1) + "\n").encode())
+        written = {**results, **facts}
+        text = json.dumps(plain(written) if exact else rounded(written), indent=1)
+        write_atomic(self.json, f"{text}\n".encode())
 
     def read(self) -> list[dict[str, Any]]:
         """The rows that `json` holds."""
@@ -136,6 +136,13 @@ def find_experiment(name: str) -> type[Experiment]:
     """The class of an experiment, whose module is imported."""
     module, _, kind = EXPERIMENTS[name].partition(":")
     found: type[Experiment] = getattr(import_module(f"benchmarks.{module}"), kind)
+    return found
+
+
+def rounded(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values as a file holds them: plain, and numbers of five digits."""
+    text = json.dumps(plain(values))
+    found: dict[str, Any] = json.loads(text, parse_float=lambda digits: float(f"{float(digits):.5g}"))
     return found
 
 

@@ -7,11 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from recording_samples import make_episode, make_spec
 
+from benchmarks.video_rl import recorded
 from benchmarks.video_rl.recorded import CODEC, COPY, ENLARGED, MODEL
+from benchmarks.video_rl.sources import TASK
 from wm_nodes.apps.cli import main
+from wm_nodes.config.shipped import shipped_model
 from wm_nodes.recording import EpisodeBagWriter
+from wm_nodes.video_model.folder import load_video_folder, save_video_folder
 
 STEPS = 4
 CPS, DYNDIFF = "CPS 0.4", "DynDiff 0.6 gated, rms"
@@ -19,13 +24,14 @@ CPS, DYNDIFF = "CPS 0.4", "DynDiff 0.6 gated, rms"
 
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Contexts to train on and held-out ones: five episodes each."""
+    """Contexts to train on and held-out ones: five episodes each, of noise above a row that stands still."""
     folder, spec = tmp_path_factory.mktemp("clips"), make_spec(height=64, width=128)
     paths = folder / "contexts", folder / "heldout"
     for first, path in zip((0, 5), paths, strict=True):
         with EpisodeBagWriter(path, spec, run_id=path.name, start_ns=1) as bag:
             for index in range(first, first + 5):
                 episode = make_episode(spec, index, STEPS)
+                episode.images[:, -1] = 0
                 bag.write(replace(episode, ground_truth=np.full_like(episode.ground_truth, 0.1)))
     return paths
 
@@ -89,6 +95,38 @@ def test_trainings_in_the_file_are_not_made_again_and_another_plan_is_refused(
     assert json.loads(path.read_text())["rows"] == rows, "their seconds would differ"
     assert main(["benchmark", *call, "--iterations", "2"]) == 2
     assert "take another file" in " ".join(capsys.readouterr().err.split())
+
+
+def test_trainings_by_another_setup_or_of_another_base_are_refused_and_those_that_do_not_say_are_too(
+    learning: tuple[list[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    call, path = learning
+    call = ["benchmark", *call, "--iterations", "1"]
+
+    def refused(*more: str) -> str:
+        held = path.read_bytes()
+        assert main([*call, *more]) == 2 and path.read_bytes() == held
+        return " ".join(capsys.readouterr().err.split())
+
+    samplers, folder = recorded.clip_learning_samplers(), load_video_folder(shipped_model(TASK) / "video_model")
+    quicker = [replace(one, grpo=one.grpo.with_values(learning_rate=1e-3)) for one in samplers]
+    with monkeypatch.context() as patch:
+        patch.setattr(recorded, "clip_learning_samplers", lambda: quicker)
+        words = f"holds {CPS} by another setup (grpo.learning_rate 0.0002, this call has 0.001); take another file"
+        assert words in refused()
+    with torch.no_grad():
+        next(folder.network.parameters()).add_(1.0)
+    save_video_folder(tmp_path / "other", folder.codec, folder.network, folder.clip, {"task": TASK})
+    found = refused("--video-model", str(tmp_path / "other"))
+    assert f"holds {CPS} by another base (sha256.network.safetensors " in found
+    found = refused("--video-model", str(tmp_path / "other"), "--samplers", "CPS 0.6")
+    assert f"holds {CPS} by another base" in found
+    held = json.loads(path.read_text())
+    old = tmp_path / "old.json"
+    rows = [{name: value for name, value in row.items() if name not in ("setup", "base")} for row in held["rows"]]
+    old.write_text(json.dumps({**held, "rows": rows}))
+    assert "another setup (not recorded); take another file" in refused("--json", str(old))
 
 
 def test_sizes_are_shown_beside_the_own_one_enlarged_and_the_own_one_is_the_same_there(tmp_path: Path) -> None:

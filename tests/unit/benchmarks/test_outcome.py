@@ -1,12 +1,13 @@
 """The outcome benchmark on recorded simulator episodes, with the shipped model, its reader and the shipped judge."""
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benchmarks.video_rl.outcome import METRICS, AsWritten
+from benchmarks.video_rl.outcome import METRICS, AsWritten, kept_weights, weights_name
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.config.seed_ranges import HELDOUT
@@ -38,7 +39,7 @@ def test_the_command_trains_measures_the_kept_weights_and_goes_on_where_its_file
     assert [row["sampler"] for row in first] == ARMS
     for row in first:
         assert len(row["evaluations"]) == 2
-        assert [int(buffers) for buffers in row["measured"]] == [0, 1, 2]
+        assert [int(buffers) for buffers in row["measured"]] == [0, 1, 2] and row["weights"].keys() == {"1", "2"}
         assert all(set(found) == {*METRICS, *DONE} for found in row["measured"].values())
         assert row["measured"]["0"] == first[0]["measured"]["0"], "all arms begin with the same model"
     assert first[0]["plan"]["rewards"] == [["outcome", 1.0]] and first[2]["plan"]["rewards"] == [["agent", 1.0]]
@@ -47,11 +48,23 @@ def test_the_command_trains_measures_the_kept_weights_and_goes_on_where_its_file
     files = {f"{name}_0_{buffers}.safetensors" for name in names for buffers in (1, 2)}
     assert {file.name for file in kept.iterdir()} == files
     assert len({file.read_bytes() for file in kept.iterdir()}) == 8, "two arms are the same training"
+    assert kept_weights(kept, first[0], 2) == kept / "CPS_0.4_0_2.safetensors"
     assert (tmp_path / "found_proxy.png").is_file()
     assert "executed_success" in METRICS and "metrics that nothing trained on" in capsys.readouterr().out
     assert main([*call[:-len(ARMS)], ARMS[0], "--seeds", "0", "1"]) == 0
     rows = rows_of(path)
     assert rows[:4] == first and [(row["sampler"], row["seed"]) for row in rows[4:]] == [(ARMS[0], 1)]
+
+
+def test_weights_that_another_training_left_under_the_same_name_are_not_measured(tmp_path: Path) -> None:
+    path = tmp_path / weights_name("CPS 0.4", 0, 2)
+    row: dict[str, Any] = {"sampler": "CPS 0.4", "seed": 0, "weights": {"2": hashlib.sha256(b"own").hexdigest()}}
+    path.write_bytes(b"own")
+    assert kept_weights(tmp_path, row, 2) == path
+    path.write_bytes(b"another")
+    for some in (row, {**row, "weights": {}}, {**row, "seed": 1}):
+        with pytest.raises(ValueError, match="is not what the training of this row left; take another --json file"):
+            kept_weights(tmp_path, some, 2)
 
 
 def test_as_written_is_the_preset_of_the_paper_but_for_what_a_small_model_needs() -> None:

@@ -68,6 +68,22 @@ def test_a_clip_equal_to_its_recording_has_full_scores_and_a_shifted_object_lose
         score_clips(moved[:, :2], clips, TruthfulProbe(), 1)  # type: ignore[arg-type]
 
 
+def test_scenery_is_unknown_where_nothing_stands_still_and_is_no_reward_there() -> None:
+    """The second of two recordings is of a camera that moves."""
+    frames = flat_clips(100, 100)
+    frames[1, 1:] += 50
+    clips = pictures_of(frames)
+    found = score_clips(frames, clips, TruthfulProbe(), 1)["scenery"]  # type: ignore[arg-type]
+    assert float(found[0]) == 0.0 and found[1].isnan()
+    folder: Any = SimpleNamespace(codec=small_codec(), clip={"num_conditioning": 1})
+    probe: Any = TruthfulProbe()
+    paid, unpaid = (load_video_config("base", {"rewards.scenery": weight}) for weight in (-5.0, 0.0))
+    RecordedContexts(folder, clips, unpaid, probe)
+    RecordedContexts(folder, clips.first(1), paid, probe)
+    with pytest.raises(ValueError, match=r"no pixel of recording 1 does; set rewards\.scenery 0"):
+        RecordedContexts(folder, clips, paid, probe)
+
+
 class FirstPixel:
     """The codec whose one latent is the red value of the first pixel, of 255."""
 
@@ -133,7 +149,7 @@ def test_without_simulator_state_pictures_are_scored_and_all_else_is_unknown(tmp
         return source.scores(GroupRequest((0,), 1, 0, 0), clips.frames)
 
     found = scores(**weights)
-    known = {"scenery", "psnr_db", *PICTURE_SCORES}
+    known = {"psnr_db", *PICTURE_SCORES}  # frames of noise have no scenery
     assert {name for name, values in found.items() if torch.isfinite(values).all()} == known
     assert mix_rewards(found, weights).tolist() == [1.0]
     assert found.keys() - scores(tracking=1.0).keys() == set(PICTURE_SCORES)
@@ -226,6 +242,14 @@ def test_the_paper_s_preset_is_its_table_5() -> None:
         ({"rollout.samplr.eta": 0.5}, "unknown setting 'rollout.samplr'"),
         ({"grpo.learning_rate": "fast"}, "grpo.learning_rate"),
         ({"rollout.sampler.mask.m_min": 0}, r"m_min.*greater than 0 \(got 0\)"),
+        (
+            {"rollout.sampler.arm": "ode", "grpo.objective": "nft", "grpo.kl.beta": 0, "groups.shared_noise": True},
+            r"rollout\.sampler\.arm ode.*the same; set groups\.shared_noise false",
+        ),
+        (
+            {"rollout.sampler.eta": 0, "grpo.objective": "nft", "grpo.kl.beta": 0, "groups.shared_noise": True},
+            r"eta 0.*the same; set groups\.shared_noise false",
+        ),
         ({"task": "fly"}, r"task.*push_cube.*'fly'"),
         ({"evaluation.window": 2}, r"evaluation\.window.*greater than or equal to 3 \(got 2\)"),
     ],

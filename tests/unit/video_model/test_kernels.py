@@ -12,6 +12,7 @@ from video_toys import (
     Analytic,
     mask_config,
     randn,
+    rollout_config,
     sampler_config,
     swirl,
     times,
@@ -25,7 +26,7 @@ from video_toys import (
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import RolloutConfig
 from wm_nodes.video_model import StepContext, flow_times, initial_noise, sample_videos, select_steps, step
-from wm_nodes.video_model.kernels import SIGMA_LIMIT, estimates, with_conditioning
+from wm_nodes.video_model.kernels import SIGMA_LIMIT, estimates, sage_variance, with_conditioning
 
 BIG = (1, 4, 8, 16, 16)
 """D = 8192."""
@@ -318,6 +319,18 @@ def test_a_mask_floor_of_one_is_coefficient_preserving_sampling_bit_for_bit(comb
 def test_a_noise_level_at_which_the_sine_map_folds_is_refused(arm: str, eta: float) -> None:
     with pytest.raises(ValueError, match=rf"eta must be in \[0, 1\] for {arm}, got {eta}"):
         sampler_config(arm, eta)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("shift", "most"), [(5.0, 67), (3.0, 111), (1.0, 332)])
+def test_a_schedule_whose_first_step_by_sage_has_no_noise_is_refused_by_its_numbers(shift: float, most: int) -> None:
+    sage = sampler_config("sage", 0.5)
+    times = flow_times(rollout_config(num_steps=most, shift=shift, sampler=sage).num_steps, shift)
+    assert sage_variance(times[:1], times[1:2], 0.25, 0.0) > 0
+    times = flow_times(most + 1, shift)
+    assert sage_variance(times[:1], times[1:2], 0.25, 0.0) == 0
+    words = f"arm sage has no noise with num_steps {most + 1} and shift {shift:g},.*lower num_steps or shift"
+    with pytest.raises(ValueError, match=words):
+        rollout_config(num_steps=most + 1, shift=shift, sampler=sage)
 
 
 def test_the_euler_sde_arms_take_a_noise_level_above_one_and_an_unknown_arm_is_named() -> None:

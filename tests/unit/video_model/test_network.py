@@ -1,13 +1,15 @@
 """What the video network says of velocities around the last given frame. Shapes: B clips, C channels, F frames."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
-from video_toys import ACTION_DIM, toy_condition
+from video_toys import ACTION_DIM, SHAPE, tiny_network, toy_condition
 
 from wm_nodes.video_model import Condition, NetworkSettings, VideoNetwork
+from wm_nodes.video_model.conditions import hashed_words
 from wm_nodes.video_model.kernels import with_conditioning
 from wm_nodes.video_model.network import LEAST_SPREAD
 from wm_nodes.video_rl.pretraining import change_std
@@ -60,6 +62,27 @@ def test_where_nothing_changes_the_velocity_is_known_but_for_the_least_spread() 
     for time, limit in ((0.2, 0.02), (1.0, 0.001)):
         error = (velocity(network(-30.0), condition, clips, noise, time) - (noise - clips))[:, :, 1:]
         assert float(error.square().mean()) < limit
+
+
+def test_a_clip_s_condition_does_not_depend_on_the_longer_instruction_of_a_neighbour() -> None:
+    """Their words are averaged over each one's own; the padding is zeros."""
+    net, E = tiny_network(text_dim=8), 8
+    words = hashed_words(["push the cube", "push the cube to the goal", ""], E)
+    condition, shape = toy_condition(3, text_dim=E), (3, *SHAPE)
+    condition = replace(condition, text=words)
+    x, t = torch.randn(shape, generator=torch.Generator().manual_seed(0)), torch.full((3,), 0.5, dtype=torch.float64)
+    together = net(x, t, condition)
+    for row, length in enumerate((3, 6, 0)):
+        alone = replace(condition.rows(slice(row, row + 1)), text=words[row : row + 1, :length])
+        torch.testing.assert_close(net(x[row : row + 1], t[:1], alone), together[row : row + 1], rtol=1e-5, atol=1e-6)
+
+
+def test_the_mean_of_instructions_of_one_length_is_what_it_was_bit_for_bit() -> None:
+    net, condition = tiny_network(text_dim=8), toy_condition(2, text_dim=8)
+    seen: list[Tensor] = []
+    net.text.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    net(torch.zeros(2, *SHAPE), torch.ones(2, dtype=torch.float64), condition)
+    assert torch.equal(seen[0], condition.text.sum(1) / 3)
 
 
 def test_change_std_is_measured_after_the_last_given_frame() -> None:

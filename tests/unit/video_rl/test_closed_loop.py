@@ -1,6 +1,7 @@
 """Continuations of a video model's own frames: what a group shares, what it is scored against, and its head-room."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
+from wm_nodes.video_rl import validation
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.horizons import Headroom, horizon_scores, measure_headroom
 from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, score_pictures
@@ -23,7 +25,7 @@ from wm_nodes.video_rl.sampling import (
     RecordedContexts,
 )
 from wm_nodes.video_rl.train import post_train, sample_buffers
-from wm_nodes.video_rl.validation import context_scores
+from wm_nodes.video_rl.validation import context_scores, validation_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
 GIVEN, NEW, FRAMES = 3, 2, 9
@@ -100,11 +102,11 @@ def test_how_many_clips_come_before_is_drawn_for_each_iteration_from_the_seed_al
     for iteration, history in enumerate(drawn[:12]):
         request = source.request(iteration, 0)
         assert history is not None
-        first, given = source.place(request)
+        first, given = source.place(history)
         assert (first, given) == ((2 * history + 1 - GIVEN, GIVEN) if history else (0, 1))
         assert source.references(request).frames[0, 0, 0, 0, 0] == first + 10 * request.contexts[0]
     plain = make_source(CONFIG.with_values(groups=CONFIG.groups.with_values(history=0))).request(0, 0)
-    assert plain.history is None and source.place(plain) == (0, 1)
+    assert plain.history is None and source.place(None) == (0, 1)
 
 
 def test_a_continuation_is_scored_on_its_new_frames_alone() -> None:
@@ -134,6 +136,29 @@ def test_a_group_is_trained_and_evaluated_by_closeness_where_no_recording_has_si
     assert heldout["closeness"].isfinite().all() and set(PICTURE_SCORES) <= set(WATCHED)
     for one in measure_headroom(folder, blind, config, probe):
         assert one.codec > one.reward and one.gain[0] > 0
+
+
+def test_scenery_pays_where_the_frames_of_each_clip_have_some_and_held_out_clips_without_are_not_refused() -> None:
+    """The camera moves by 3 grey values a frame, 12 within five of them."""
+    slow = replace(recorded(), frames=3 * recorded().frames)
+    config = CONFIG.with_values(rewards={"scenery": -1.0})
+    whole = config.with_values(groups=config.groups.with_values(history=0))
+    folder, probe = make_folder(), PositionProbe(8, 12)
+    assert make_source(config).config == RecordedContexts(folder, slow, config, probe).config
+    with pytest.raises(ValueError, match="no pixel of recording 0 does"):
+        RecordedContexts(folder, slow, whole, probe)
+    fast = replace(slow, frames=2 * slow.frames)
+    with pytest.raises(ValueError, match="no pixel of recording 0 does"):
+        RecordedContexts(folder, fast, config, probe)
+    assert context_scores(folder, fast, probe, config)["scenery"].isnan().all()
+
+
+def test_the_held_out_reward_is_known_where_what_is_not_scored_has_no_weight(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(validation, "load_clips", lambda *_: recorded())
+    monkeypatch.setattr(validation, "load_probe", lambda *_: PositionProbe(8, 12))
+    config = CONFIG.with_values(rewards={"psnr_db": 0.5, "agent": 0.0})
+    found = validation_scores(make_folder(), [], Path(), config)()
+    assert found["reward"] == pytest.approx(0.5 * found["psnr_db"])
 
 
 def test_settings_that_a_model_or_its_recordings_cannot_have_are_refused() -> None:

@@ -186,6 +186,7 @@ def test_an_optimizer_step_waits_for_the_device_only_to_report_and_to_see_that_i
 def clips(count: int, seed: int, height: int = 16, width: int = 32) -> Clips:
     generator = torch_stream(seed, "test_device_clips")
     frames = torch.randint(0, 256, (count, 3, height, width, 3), generator=generator, dtype=torch.uint8)
+    frames[:, :, 0] = 0  # scenery
     actions = torch.randn(count, 2, ACTION_DIM, generator=generator)
     truth = torch.rand(count, 3, len(GROUND_TRUTH_NAMES), generator=generator).numpy()
     return toy_clips(frames, actions, truth, ("push the cube",) * count)

@@ -15,7 +15,7 @@ from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.training.metrics import read_metrics
 from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model import VideoNetwork
-from wm_nodes.video_rl.reward_hacking import WATCHED, alarm_text, hacked_slopes, hacking_alarms
+from wm_nodes.video_rl.reward_hacking import WATCHED, alarm_text, hacked_slopes, hacking_alarms, watched_scores
 from wm_nodes.video_rl.training_run import VIDEO_FILES, VideoRun, progress
 
 ROLLOUT = toy_rollout_settings(micro_batch=8)
@@ -82,6 +82,15 @@ def test_a_missing_value_takes_its_score_out_and_a_missing_reward_its_evaluation
     rows[3]["psnr_db"] = None
     assert list(hacked_slopes(hacking_alarms(rows, window=3))) == ["tracking"]
     assert not hacking_alarms(lines([1.0, None, 3.0], tracking=[3.0, 2.0, 1.0]), window=3)
+    rows = lines([1.0, 2.0, 3.0, 4.0], tracking=[math.nan, 3.0, 2.0, 1.0])
+    rows[1]["tracking"] = None
+    assert list(hacked_slopes(hacking_alarms(rows, window=3))) == ["tracking"], "a null of before mutes for ever"
+
+
+def test_where_actions_are_given_the_end_of_a_clip_raises_no_alarm() -> None:
+    rows = lines([1.0, 2.0, 3.0], success=[0.5, 0.4, 0.3], outcome=[0.5, 0.4, 0.3], tracking=[0.1, 0.2, 0.3])
+    assert hacking_alarms(rows, window=3, watched=watched_scores(hide_actions=False)) == {"hacked": 0.0}
+    assert hacking_alarms(rows, window=3, watched=watched_scores(hide_actions=True))["hacked"] == 2.0
 
 
 class Falling:
@@ -92,7 +101,8 @@ class Falling:
 
     def __call__(self) -> dict[str, float]:
         self.seen.append(weights(self.network))
-        return {"tracking": 1.0 - 0.1 * len(self.seen), "psnr_db": 20.0 + len(self.seen), "reward": math.nan}
+        falling = 1.0 - 0.1 * len(self.seen)
+        return {"tracking": falling, "success": falling, "psnr_db": 20.0 + len(self.seen), "reward": math.nan}
 
 
 @pytest.fixture

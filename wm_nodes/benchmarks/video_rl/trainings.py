@@ -1,7 +1,6 @@
 """Trainings of several samplers at several seeds: run, kept in one file, compared."""
 
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
@@ -10,7 +9,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from pydantic import TypeAdapter
 
-from benchmarks.experiment import Count, OnDevice, console
+from benchmarks.experiment import Count, OnDevice, console, rounded
 from benchmarks.video_rl import tables
 from benchmarks.video_rl.comparison import MEASURES, SamplerComparison, compare_samplers
 from benchmarks.video_rl.samplers import SamplerSetup
@@ -69,9 +68,11 @@ class Trainings(OnDevice, Generic[Plan]):
         self.show(rows, comparisons)
 
     def train_all(self) -> list[dict[str, Any]]:
-        """The rows of the chosen trials at every seed; the file is written after each training."""
-        trials = self.trials()
-        rows = self._finished(trials)
+        """The rows of the chosen trials at every seed, each with what it was made by; the file is written after each
+        training."""
+        trials, base = self.trials(), self.base()
+        made_by = {trial.sampler.name: made_of(trial, base) for trial in trials}
+        rows = self._finished(made_by, base)
         done = {(row["sampler"], row["seed"]) for row in rows}
         wanted = select({trial.sampler.name: trial for trial in trials}, self.samplers)
         todo = [(trial, seed) for seed in self.seeds for trial in wanted if (trial.sampler.name, seed) not in done]
@@ -82,13 +83,14 @@ class Trainings(OnDevice, Generic[Plan]):
                 ) as pool:
                     futures = {pool.submit(self.train, trial, seed, _unseen): trial for trial, seed in todo}
                     for future in as_completed(futures):
-                        rows.append(future.result())
-                        bar.update(futures[future].plan.iterations)
+                        trial = futures[future]
+                        rows.append({**future.result(), **made_by[trial.sampler.name]})
+                        bar.update(trial.plan.iterations)
                         self.write_rows(rows)
                 return rows
             for trial, seed in todo:
                 bar.set_postfix_str(f"{trial.sampler.name}, seed {seed}")
-                rows.append(self.train(trial, seed, bar.update))
+                rows.append({**self.train(trial, seed, bar.update), **made_by[trial.sampler.name]})
                 self.write_rows(rows)
         return rows
 
@@ -98,18 +100,20 @@ class Trainings(OnDevice, Generic[Plan]):
         setups = settings_of([trial.sampler for trial in self.trials() if trial.sampler.name in names])
         self.write({**self.base(), **setups, "comparisons": list(map(asdict, comparisons)), "rows": rows})
 
-    def _finished(self, trials: Sequence[SamplerTrial[Plan]]) -> list[dict[str, Any]]:
-        """The rows of an earlier call; a trial of this one that it ran by another plan is refused."""
+    def _finished(self, made_by: Mapping[str, Mapping[str, Any]], base: Mapping[str, Any]) -> list[dict[str, Any]]:
+        """The rows of an earlier call; one that begins with another base, or a trial of this call that it ran by
+        another setup or plan, is refused."""
         rows = self.read()
         if any("sampler" not in row for row in rows):
             raise ValueError(f"{self.json} holds rows of another experiment; take another file")
-        plans = {trial.sampler.name: json.loads(json.dumps(asdict(trial.plan))) for trial in trials}
         for row in rows:
-            plan, name = row["plan"], row["sampler"]
-            if plan != plans.get(name, plan):
-                raise ValueError(
-                    f"{self.json} holds {name} by plan {plan}, this call has {plans[name]}; take another file"
-                )
+            name = row["sampler"]
+            for part, wanted in made_by.get(name, rounded({"base": base})).items():
+                if row.get(part) != wanted:
+                    raise ValueError(
+                        f"{self.json} holds {name} by another {part} ({_difference(row.get(part), wanted)}); take "
+                        "another file"
+                    )
         return rows
 
 
@@ -153,12 +157,26 @@ def settings_of(samplers: list[SamplerSetup]) -> dict[str, Any]:
     return {"samplers": TypeAdapter(list[SamplerSetup]).dump_python(samplers)}
 
 
+def made_of(trial: SamplerTrial[Plan], base: Mapping[str, Any]) -> dict[str, Any]:
+    """What a row of the trial is made by, as a file holds it: plan, setup of the sampler, base."""
+    setup = TypeAdapter(SamplerSetup).dump_python(trial.sampler)
+    return rounded({"plan": asdict(trial.plan), "setup": setup, "base": base})
+
+
 def select(known: dict[str, T], names: Sequence[str]) -> list[T]:
     """Those of the names; without any, all."""
     unknown = [name for name in names if name not in known]
     if unknown:
         raise ValueError(f"unknown samplers {', '.join(unknown)}; choose among: {'; '.join(known)}")
     return [known[name] for name in names or known]
+
+
+def _difference(found: Any, wanted: Any, name: str = "") -> str:
+    """What differs, by dotted name: what a file holds, and what this call has."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        names = [key for key in {**found, **wanted} if found.get(key) != wanted.get(key)]
+        return "; ".join(_difference(found.get(key), wanted.get(key), f"{name}.{key}".strip(".")) for key in names)
+    return f"{name} {found}, this call has {wanted}".strip() if found is not None else f"{name} not recorded".strip()
 
 
 def _unseen() -> None:

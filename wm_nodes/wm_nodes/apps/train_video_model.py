@@ -44,7 +44,7 @@ from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_rl.execution_reward import check_execution
 from wm_nodes.video_rl.pretraining import make_video_model, shipped_video_model
 from wm_nodes.video_rl.recorded_buffers import recorded_bags
-from wm_nodes.video_rl.reference_reward import load_probe
+from wm_nodes.video_rl.reference_reward import check_scenery, load_probe
 from wm_nodes.video_rl.training_run import progress
 
 HELDOUT_EPISODES = 100
@@ -118,6 +118,8 @@ def _run(arguments: argparse.Namespace, config: VideoRlConfig, run_dir: Path) ->
     clips = load_clips(bags, config.model.stride, config.clip_steps)
     if config.rewards.get(EXECUTION):
         check_execution(config, clips)
+    if config.rewards.get("scenery") and not config.groups.history:
+        check_scenery(clips)
     if config.rewards.get(AGENT):
         judge, fps = for_task(config.judge, config.task), clip_fps(bags[0], config.model.stride)
         check_clips(judge, tuple(clips.frames.shape[1:]), fps)

@@ -1,8 +1,10 @@
 """The end of a run of loop 2: held-out scores before and after, pictures, summary.json, report.html, the table."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,15 +36,18 @@ from wm_nodes.video_model.success_reader import reader_of
 from wm_nodes.video_rl.heldout_metrics import load_or_measure_unrewarded, make_yardstick
 from wm_nodes.video_rl.pretraining import BEFORE
 from wm_nodes.video_rl.reference_reward import more_is_better
-from wm_nodes.video_rl.reward_hacking import SECTION, WATCHED, alarm_text, hacked_slopes
+from wm_nodes.video_rl.reward_hacking import SECTION, alarm_text, hacked_slopes, watched_scores
 from wm_nodes.video_rl.sampling import sample_by_ode
 from wm_nodes.video_rl.training_run import VIDEO_FILES
-from wm_nodes.video_rl.validation import load_or_measure_scores
+from wm_nodes.video_rl.validation import OUTCOMES, load_or_measure_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
 AFTER, UNREWARDED = (Path("evaluations") / name for name in ("after.json", "unrewarded.json"))
 STRIPS = 3
 UNKNOWN = "the probe does not read what it asks for, or the recordings do not hold it"
+MOVING = "in a recording no pixel stands still"
+ENDS = (*OUTCOMES, "executed_success", "reader_success")
+"""How a clip ends: with given actions neither better nor worse, see OUTCOMES."""
 
 
 def conclude(
@@ -68,18 +73,18 @@ def conclude(
         ),
     )
     known = known_scores(before, after)
-    missing = {name: UNKNOWN for name in TITLES if name in before and name not in known}
+    missing = {
+        name: MOVING if name == "scenery" else UNKNOWN for name in TITLES if name in before and name not in known
+    }
     lines = read_metrics(run_dir, SECTION) if (run_dir / FILE_NAME).is_file() else []
     watched = [line for line in lines if line.get("hacked") is not None]
     summary = as_first_made(run_dir, ClipSummary(
         task=config.task, preset=preset, seed=config.seed, iterations=iterations, version=version,
         contexts=len(before["success"]),
-        scores={name: score_change(name, before[name], after[name], config.seed) for name in known},
-        unrewarded={
-            name: score_change(name, found.before[name], found.after[name], config.seed) for name in found.before
-        },
+        scores=score_changes(known, before, after, config),
+        unrewarded=score_changes(found.before, found.before, found.after, config),
         executed=len(found.before.get("executed_success", ())), not_measured=missing | found.missing,
-        evaluations=len(lines), watched=[name for name in WATCHED if watched and name in watched[-1]],
+        evaluations=len(lines), watched=compared_scores(watched, config),
         hacked=None if not watched else [
             {"step": line["step"], "reward_slope": line["reward_slope"], "slopes": hacked_slopes(line),
              "text": alarm_text(line)} for line in watched if line["hacked"]
@@ -105,6 +110,22 @@ def known_scores(before: Mapping[str, Sequence[float]], after: Mapping[str, Sequ
     """Which scores are numbers in every context; success, say, is none where a task's rule asks for what no probe
     reads."""
     return [name for name in TITLES if name in before and np.isfinite([*before[name], *after[name]]).all()]
+
+
+def compared_scores(watched: Sequence[Mapping[str, Any]], config: VideoRlConfig) -> list[str]:
+    """Which scores the alarm compared in the newest of the evaluations at which it looked."""
+    names = watched_scores(config.groups.hide_actions)
+    return [name for name in names if watched and watched[-1].get(name) is not None]
+
+
+def score_changes(
+    names: Iterable[str], before: Mapping[str, Sequence[float]], after: Mapping[str, Sequence[float]],
+    config: VideoRlConfig,
+) -> dict[str, ScoreChange]:
+    """score_change() by name; with given actions ENDS have no verdict."""
+    changes = {name: score_change(name, before[name], after[name], config.seed) for name in names}
+    unjudged = () if config.groups.hide_actions else ENDS
+    return {name: replace(change, verdict="") if name in unjudged else change for name, change in changes.items()}
 
 
 def score_change(name: str, before: Sequence[float], after: Sequence[float], seed: int) -> ScoreChange:

@@ -1,5 +1,6 @@
 """Settings of loop 2, the post-training of the video model. The numbers live in presets/video/*.yaml, not here."""
 
+import math
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
@@ -15,6 +16,8 @@ from wm_nodes.config.sections import (
     SettingsSection,
 )
 
+SAGE_LATEST = 0.997
+"""t~ of SAGE's first step (DD-24)."""
 Anchor = Literal["buffer", "frozen", "lora_off", "dual"]
 
 
@@ -159,6 +162,22 @@ class RolloutConfig(SettingsSection):
     buffer_device: Literal["model", "cpu"]
     """Where rollout buffers lie: with the model, or in the host's memory, from where training moves micro-batches."""
 
+    @model_validator(mode="after")
+    def _sage_begins_with_noise(self) -> Self:
+        """DD-24 has none from t = 1 to t_1 = 1 - left where ln(left / (1 - t~)) <= left."""
+        left = 1 / (1 + self.shift * (self.num_steps - 1))
+        if self.sampler.arm == "sage" and math.log(left / (1 - SAGE_LATEST)) <= left:
+            raise ValueError(
+                f"the first step of sampler.arm sage has no noise with num_steps {self.num_steps} and shift "
+                f"{self.shift:g}, whose t_1 is {1 - left:.4f}, beyond {SAGE_LATEST}; lower num_steps or shift"
+            )
+        return self
+
+    @property
+    def is_ode(self) -> bool:
+        """Whether no step draws noise."""
+        return self.sampler.arm == "ode" or self.sampler.eta == 0 or self.num_steps == 1
+
 
 class AdvantageConfig(SettingsSection):
     clip: PositiveFloat
@@ -266,6 +285,17 @@ class VideoRlConfig(SettingsSection):
     """How it is sampled."""
     grpo: GrpoConfig
     """How it is learned from."""
+
+    @model_validator(mode="after")
+    def _samples_different_clips(self) -> Self:
+        if self.groups.shared_noise and self.rollout.is_ode and self.grpo.objective == "nft":
+            sampler = self.rollout.sampler
+            raise ValueError(
+                f"groups.shared_noise and a sampler without noise (rollout.sampler.arm {sampler.arm}, eta "
+                f"{sampler.eta:g}, rollout.num_steps {self.rollout.num_steps}) make all clips of a group the same; set "
+                "groups.shared_noise false"
+            )
+        return self
 
     @model_validator(mode="after")
     def _knows_its_conditions(self) -> Self:

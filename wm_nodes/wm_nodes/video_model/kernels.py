@@ -13,13 +13,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from wm_nodes.config.video import SamplerConfig
+from wm_nodes.config.video import SAGE_LATEST, SamplerConfig
 from wm_nodes.video_model.mask import dynamic_mask
 
 SIGMA_LIMIT = 1 - 1e-3
 """sigma <= SIGMA_LIMIT * s where a noise budget raises the mask above 1: sqrt(s^2 - sigma^2) stays off its kink."""
-SAGE_LATEST = 0.997
-"""t~ of SAGE's first step."""
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,8 @@ class VideoNetwork(nn.Module):
         steered = self._steering(x, condition) * kept[:, :1, None]
         film: Tensor = self.time(time_features(times_BF)) + self.action(steered)
         if self.settings.text_dim:
-            text = condition.text.to(x.dtype).sum(1) / max(1, condition.text.shape[1])  # no token: zeros
+            tokens_B1 = (condition.text != 0).any(2).sum(1, keepdim=True).clamp_min(1)  # padding is zeros
+            text = condition.text.to(x.dtype).sum(1) / tokens_B1
             film = film + (self.text(text) * kept[:, 1:]).unsqueeze(1)
         return film
 

@@ -100,8 +100,8 @@ def sample_videos(
             f"steps {outside} cannot be stochastic; of {settings.num_steps} steps all but the last, 0 to "
             f"{settings.num_steps - 2}, can"
         )
-    if settings.sampler.arm == "ode" or settings.sampler.eta == 0:
-        chosen = []  # no step has noise
+    if settings.is_ode:
+        chosen = []
     rollout = _unsampled(noise, condition.num_conditioning, settings, chosen)
     spent = torch.zeros(len(chosen), device=noise.device)
     for i in range(0, len(noise), settings.micro_batch):

@@ -44,7 +44,8 @@ def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_con
     tracking: mean exp(-error / 3 cm) of object and tool over generated frames, in (0, 1]. scenery: mean absolute error,
     [0, 1], where the recording stands still. psnr_db: of generated frames. object_cm, tool_cm: mean position errors.
     success: 1 where the task is done in the last frame. outcome: exp(-d / 5 cm), d what is then left to the edge of the
-    goal (DD-32). All but scenery and psnr_db are NaN where the recording has no simulator state.
+    goal (DD-32). All but scenery and psnr_db are NaN where the recording has no simulator state, scenery where nothing
+    in it stands still.
 
     Raises:
         ValueError: clips and recordings differ in number or size.
@@ -58,9 +59,8 @@ def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_con
     object_m, tool_m = (np.linalg.norm((positions - truth)[..., columns], axis=-1) for columns in (thing, tool))
     tracking = (np.exp(-object_m / TRACKING_SCALE_M) + np.exp(-tool_m / TRACKING_SCALE_M)) / 2
     error = (frames[:, generated].float() - recorded[:, generated].float()) / 255
-    changed = (recorded.int() - recorded[:, :1].int()).abs().amax((1, 4)) > SEEN_MOTION
-    still = (~changed)[:, None, :, :, None].float()
-    weight = still.sum((1, 2, 3, 4)).clamp_min(1) * error.shape[1] * error.shape[4]
+    still = still_pixels(recorded)[:, None, :, :, None].float()
+    weight = still.sum((1, 2, 3, 4)) * error.shape[1] * error.shape[4]
     left_m = distance_left(positions[:, -1], truth[:, -1], references.task)
     scores = (
         torch.from_numpy(tracking.mean(1)),
@@ -95,6 +95,21 @@ def score_pictures(
     closeness = ((psnr / FULL_PSNR_DB).clamp_max(1) + similarity + perceptual) / 3
     scores = zip(PICTURE_SCORES, (similarity, perceptual, closeness), strict=True)
     return {name: values.double().mean(1).cpu() for name, values in scores}
+
+
+def still_pixels(recorded: Tensor) -> Tensor:
+    """Return which pixels of recordings, uint8 (N, F, H, W, 3), are scenery, bool (N, H, W)."""
+    return (recorded.int() - recorded[:, :1].int()).abs().amax((1, 4)) <= SEEN_MOTION
+
+
+def check_scenery(recordings: Clips) -> None:
+    """Raise ValueError where a recording has no scenery, so that the reward `scenery` would be unknown."""
+    for row in range(len(recordings)):
+        if not still_pixels(recordings.frames[row : row + 1]).any():
+            raise ValueError(
+                f"the reward scenery compares what stands still, and no pixel of recording {row} does; set "
+                "rewards.scenery 0, or take recordings of a camera that stands still"
+            )
 
 
 def distance_left(positions: FloatArray, truth: FloatArray, task: str) -> FloatArray:

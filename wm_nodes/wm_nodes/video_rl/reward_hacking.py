@@ -11,10 +11,12 @@ import numpy as np
 
 from wm_nodes.core.statistics import t_975
 from wm_nodes.video_rl.reference_reward import CLIP_SCORES, PICTURE_SCORES, more_is_better
+from wm_nodes.video_rl.validation import OUTCOMES
 
 SECTION = "heldout"
 """Of metrics.jsonl: scores by name, mean over the contexts, at the number of buffers trained on."""
 WATCHED = (*CLIP_SCORES, *PICTURE_SCORES)
+"""See watched_scores()."""
 
 
 def find_hacked_metrics(proxy: Sequence[float], held_out: Mapping[str, Sequence[float]]) -> dict[str, float]:
@@ -35,6 +37,11 @@ def find_hacked_metrics(proxy: Sequence[float], held_out: Mapping[str, Sequence[
     return {name: trend for name, (trend, error) in slopes.items() if trend < -widths * error}
 
 
+def watched_scores(hide_actions: bool) -> tuple[str, ...]:
+    """Return what is compared with the reward: with given actions not OUTCOMES, of which more is no better there."""
+    return tuple(name for name in WATCHED if hide_actions or name not in OUTCOMES)
+
+
 def slope(values: Sequence[float]) -> tuple[float, float]:
     """Return the least-squares slope per step and its standard error."""
     y = np.asarray(values, np.float64)
@@ -44,11 +51,13 @@ def slope(values: Sequence[float]) -> tuple[float, float]:
     return trend, float(np.sqrt((residual**2).sum() / max(1, len(y) - 2) / (x * x).sum()))
 
 
-def hacking_alarms(lines: Sequence[Mapping[str, Any]], window: int) -> dict[str, float]:
+def hacking_alarms(
+    lines: Sequence[Mapping[str, Any]], window: int, watched: Sequence[str] = WATCHED
+) -> dict[str, float]:
     """Return the alarms over the newest `window` evaluations in lines of metrics.jsonl; {} while there are fewer.
 
     The reward of an evaluation is the mean of the buffers since the one before; slopes are per evaluation, of
-    more_is_better(). Only WATCHED scores are compared.
+    more_is_better(). watched: the scores that are compared, where every one of these evaluations has them.
     """
     rewards = {line["step"]: line["reward_mean"] for line in lines if line["section"] == "grpo"}
     evaluations = {line["step"]: line for line in lines if line["section"] == SECTION}
@@ -61,8 +70,9 @@ def hacking_alarms(lines: Sequence[Mapping[str, Any]], window: int) -> dict[str,
             rows.append(evaluations[step])
     if len(proxy) < window:
         return {}
-    names = [name for name in WATCHED if all(row.get(name) is not None for row in rows)]
-    curves = {name: more_is_better(name, [row[name] for row in rows[-window:]]).tolist() for name in names}
+    rows = rows[-window:]
+    names = [name for name in watched if all(row.get(name) is not None for row in rows)]
+    curves = {name: more_is_better(name, [row[name] for row in rows]).tolist() for name in names}
     found = find_hacked_metrics(proxy[-window:], curves)
     alarms = {"reward_slope": slope(proxy[-window:])[0], **{f"hacked_{name}": found[name] for name in found}}
     return {"hacked": float(len(found)), **(alarms if found else {})}

@@ -22,7 +22,13 @@ from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.continuation import ClipLengths, clip_condition, continue_videos
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_rl.execution_reward import ExecutionReward, make_execution_reward
-from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, mix_rewards, score_clips, score_pictures
+from wm_nodes.video_rl.reference_reward import (
+    PICTURE_SCORES,
+    check_scenery,
+    mix_rewards,
+    score_clips,
+    score_pictures,
+)
 from wm_nodes.world_model.position_probe import PositionProbe
 
 
@@ -75,7 +81,7 @@ class RecordedContexts:
 
     Raises:
         ValueError: groups.history of a model that makes whole episodes, or of recordings that end before; as
-            make_execution_reward.
+            make_execution_reward; as check_scenery where that is a reward.
     """
 
     def __init__(
@@ -87,6 +93,9 @@ class RecordedContexts:
             raise ValueError(
                 f"{clips} clips and one more have {wanted} frames, the recordings {frames}; lower groups.history"
             )
+        if probe is not None and config.rewards.get("scenery"):
+            for history in range(clips + 1):
+                check_scenery(self._part(contexts, history if clips else None))
         self.execution: ExecutionReward | None = None
         """Of the clips, where `execution` has a weight."""
         if probe is not None and config.rewards.get(EXECUTION):
@@ -146,17 +155,16 @@ class RecordedContexts:
         videos = continue_videos(self.folder.network, start, lengths, frames, seeds, settings)
         return clip_condition(videos, start, lengths).repeat_interleave(request.group_size)
 
-    def place(self, request: GroupRequest) -> tuple[int, int]:
-        """Return where in the recordings the request's clips begin, and how many of their frames are given."""
-        if request.history is None:
+    def place(self, history: int | None) -> tuple[int, int]:
+        """Return where in the recordings clips after such a history begin, and how many of their frames are given."""
+        if history is None:
             return 0, self.folder.clip["num_conditioning"]
-        return self._lengths().place(self._made(request.history))
+        return self._lengths().place(self._made(history))
 
     def references(self, request: GroupRequest) -> Clips:
         """Return the recordings that the request's clips are scored against, one row per clip, of the same frames."""
         recorded = self.contexts.select(torch.tensor(request.contexts).repeat_interleave(request.group_size))
-        first, given = self.place(request)
-        return recorded if request.history is None else recorded.window(first, given + self._lengths().new)
+        return self._part(recorded, request.history)
 
     def score(self, request: GroupRequest, clips: RolloutBuffer) -> RolloutBuffer:
         """Return the buffer with every score of its clips and the training reward `total`, mixed by config.rewards."""
@@ -169,13 +177,18 @@ class RecordedContexts:
 
         also: scores that are wanted beside the rewards.
         """
-        references, (_, given) = self.references(request), self.place(request)
+        references, (_, given) = self.references(request), self.place(request.history)
         scores = score_clips(frames, references, self.probe, given)
         if not {*self.config.rewards, *also}.isdisjoint(PICTURE_SCORES):
             scores |= score_pictures(frames, references, self.folder.codec, given)
         if self.execution is not None:
             scores |= self.execution.score(frames, references)
         return scores
+
+    def _part(self, recordings: Clips, history: int | None) -> Clips:
+        """The frames of recordings that clips after such a history show."""
+        first, given = self.place(history)
+        return recordings if history is None else recordings.window(first, given + self._lengths().new)
 
     def _made(self, history: int) -> int:
         """Frames of so many clips, the recorded first ones among them."""
@@ -213,7 +226,8 @@ def _condition(folder: VideoFolder, contexts: Clips, config: VideoRlConfig) -> C
 
 
 def _ode(config: VideoRlConfig, num_steps: int) -> RolloutConfig:
-    return config.rollout.with_values(num_steps=num_steps, buffer_device="model")
+    sampler = config.rollout.sampler.with_values(arm="ode")
+    return config.rollout.with_values(num_steps=num_steps, sampler=sampler, buffer_device="model")
 
 
 def _seeds(seed: int, name: str, iteration: int, group: Tensor, sample: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from wm_nodes.training.run_folder import TrainingRun, VersionFiles
 from wm_nodes.training.weights import PackedWeights, save_weights
 from wm_nodes.video_model import RolloutBuffer, VideoNetwork
 from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner
-from wm_nodes.video_rl.reward_hacking import SECTION, hacking_alarms
+from wm_nodes.video_rl.reward_hacking import SECTION, hacking_alarms, watched_scores
 from wm_nodes.video_rl.validation import HeldoutScores
 
 CHECKPOINT = "checkpoints/video_learner.safetensors"
@@ -112,7 +112,8 @@ class VideoRun(TrainingRun):
             return
         scores = self._heldout()
         lines = [*read_metrics(self.run_dir), {"section": SECTION, "step": self.iterations, **scores}]
-        self.alarms = hacking_alarms(lines, self.config.evaluation.window)
+        watched = watched_scores(self.config.groups.hide_actions)
+        self.alarms = hacking_alarms(lines, self.config.evaluation.window, watched)
         self._metrics.write(SECTION, self.iterations, {**scores, **self.alarms})
 
 

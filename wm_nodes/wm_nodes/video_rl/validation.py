@@ -23,6 +23,7 @@ from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts, sample_by
 from wm_nodes.world_model.position_probe import PositionProbe
 
 OUTCOMES = ("success", "outcome", *EXECUTION_SCORES)
+"""How a clip ends. With given actions it should end as its recording did, so that more is not better."""
 
 HeldoutScores = Callable[[], Mapping[str, float]]
 """The held-out scores of a network's weights at the moment of the call."""
@@ -36,7 +37,8 @@ def context_scores(
     Where the model chooses the motion, how near it is to the recorded one says nothing, and is left out.
     """
     contexts = heldout.first(config.evaluation.contexts)
-    whole = config.with_values(groups=config.groups.with_values(history=0))
+    rewards = {**config.rewards, "scenery": 0.0}  # here it may be unknown
+    whole = config.with_values(groups=config.groups.with_values(history=0), rewards=rewards)
     folder.network.eval()
     frames = sample_by_ode(folder, contexts, config, config.evaluation.num_steps)
     request = GroupRequest(tuple(range(len(contexts))), group_size=1, iteration=0, policy_version=0)
@@ -76,7 +78,7 @@ def validation_scores(
 
     def scores() -> dict[str, float]:
         values = context_scores(folder, clips, probe, config)
-        if config.rewards.keys() <= values.keys():
+        if {name for name, weight in config.rewards.items() if weight} <= values.keys():
             values["reward"] = mix_rewards(values, config.rewards)
         return {name: float(value.mean()) for name, value in values.items()}
 
