@@ -78,6 +78,7 @@ class PolicyNode(ManagedNode):
         self._envs_per_start = given[0].ppo.envs_per_start
         self._files = named_files(self, str(self.param("initial_policy")))
         self._spec: EnvironmentSpec | None = None
+        self._refusal: WireError | None = None
         self._announced: PolicyVersion | None = None
         self._last_reply: Reply | None = None
         self._start_barrier = StartBarrier(self, self.links.table)
@@ -193,8 +194,8 @@ class PolicyNode(ManagedNode):
         return reset_seeds(goal.seed, version, step, spec.num_envs, self._envs_per_start)
 
     def _check_spec(self, spec: EnvironmentSpec) -> None:
-        self._spec = spec
         refuse_for_policy(spec, self._expected_spec, self._holder.policy)
+        self._spec = spec
 
     def _await_version(self, version: int, work: Work) -> None:
         deadline = time.monotonic() + float(self.param("version_timeout_s"))
@@ -243,16 +244,16 @@ class PolicyNode(ManagedNode):
         self.get_logger().warning(f"emergency stop {'set' if message.data else 'released'}")
 
     def _on_spec(self, message: EnvSpec) -> None:
-        agreed: EnvironmentSpec | None = None
+        """A refused spec leaves the one before: anybody may send one."""
         try:
-            spec = convert.spec_from_msg(message)
-            self._check_spec(spec)
-            agreed = spec
+            self._check_spec(convert.spec_from_msg(message))
+            self._refusal = None
         except WireError as error:
+            self._refusal = error
             self.get_logger().error(f"env/spec refused: {error}")
             self.diagnostics.count("refused_specs", level=diagnostics.ERROR, text=str(error))
         if self._asynchronous is not None:
-            self._asynchronous.spec = agreed
+            self._asynchronous.spec = self._spec
 
     def _on_version(self, message: PolicyVersion) -> None:
         try:
@@ -268,8 +269,9 @@ class PolicyNode(ManagedNode):
     def _on_infer(self, request: InferAction.Request, response: InferAction.Response) -> InferAction.Response:
         self.require_active()
         if self._spec is None:
-            raise WireError(ErrorCode.NOT_ACTIVE, "no env/spec seen yet; start an environment or replay a bag")
-        self._check_spec(self._spec)
+            raise self._refusal or WireError(
+                ErrorCode.NOT_ACTIVE, "no env/spec seen yet; start an environment or replay a bag"
+            )
         count = len(request.state) // self._holder.policy.state_dim
         spec = replace(self._spec, num_envs=max(count, 1))
         states = floats(request.state, (spec.num_envs, spec.state_dim), "state")
