@@ -11,6 +11,7 @@ from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
 
 
+@pytest.mark.slow
 @pytest.mark.rendering
 def test_a_clone_is_replayed_in_every_split_and_a_policy_that_was_never_trained_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
