@@ -44,6 +44,24 @@ def test_a_policy_neither_acts_on_another_robot_nor_answers_for_it(
     assert all(message.mode == ActionBatch.MODE_HOLD for message in actions)
 
 
+def test_a_policy_does_not_act_for_another_robot_that_comes_in_the_place_of_its_own(
+    graph: Graph, probe: Probe, model: Path
+) -> None:
+    actions, transitions = probe.listen("action"), probe.listen("env/transition")
+    graph.start("policy", model_dir=model, mode="asynchronous")
+    graph.start_environment("toy:make_own_robot", num_envs=1, mode="asynchronous")
+    wait_until("actions", lambda: sum(message.mode == ActionBatch.MODE_POLICY for message in actions) > 3)
+    graph.kill("/wm/environment")
+    own = transitions[-1].session
+    graph.start_environment("toy:make_other_robot", num_envs=1, mode="asynchronous")
+    wait_until("the refusal", lambda: probe.value("/wm/policy", "refused_specs") == "1")
+    wait_until("the other robot's steps", lambda: sum(message.session != own for message in transitions) > 5)
+    actions.clear()
+    count = len(transitions)
+    wait_until("more of them", lambda: len(transitions) > count + 20)
+    assert not [message for message in actions if message.mode == ActionBatch.MODE_POLICY]
+
+
 def test_a_policy_is_not_evaluated_on_another_robot(graph: Graph, probe: Probe, model: Path) -> None:
     save_weights(make_policy(graph.config, model), graph.folder / "start.safetensors")
     graph.start_environment("toy:make_other_robot", namespace="/wm/sim", num_envs=1)

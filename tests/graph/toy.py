@@ -154,6 +154,11 @@ def make_holding_arm(config: RunConfig, num_envs: int, seed: int) -> Environment
     return EnvironmentBatch(make_velocity_arm(config, num_envs, seed).spec, [HoldingArm()], seed)
 
 
+def make_own_robot(config: RunConfig, num_envs: int, seed: int) -> NoopEnvironment:
+    """The robot of the configured task."""
+    return NoopEnvironment(simulation_spec(config.task, config.simulation, num_envs))
+
+
 def make_other_robot(config: RunConfig, num_envs: int, seed: int) -> NoopEnvironment:
     """Has as many values as the robot of the configured task, and is another one."""
     spec = simulation_spec(config.task, config.simulation, num_envs)

@@ -244,11 +244,15 @@ class PolicyNode(ManagedNode):
         self.get_logger().warning(f"emergency stop {'set' if message.data else 'released'}")
 
     def _on_spec(self, message: EnvSpec) -> None:
-        """A refused spec leaves the one before: anybody may send one."""
+        """A refused spec leaves the one before, as anybody may send one; what its sender shows is not acted on."""
+        spec: EnvironmentSpec | None = None
         try:
-            self._check_spec(convert.spec_from_msg(message))
+            spec = convert.spec_from_msg(message)
+            self._check_spec(spec)
             self._refusal = None
         except WireError as error:
+            if self._asynchronous is not None and spec is not None:
+                self._asynchronous.refused_session = message.session
             self._refusal = error
             self.get_logger().error(f"env/spec refused: {error}")
             self.diagnostics.count("refused_specs", level=diagnostics.ERROR, text=str(error))

@@ -60,6 +60,8 @@ class AsynchronousPolicy:
         self._outgoing = threading.Lock()
         self._stopped, self._stops = stopped, 0
         self.spec: EnvironmentSpec | None = None
+        self.refused_session = 0
+        """Of the environment that sent another robot's spec; nothing is done on its states."""
         self._changed = threading.Condition()
         self._images: dict[int, UInt8Array] = {}
         self._states: dict[int, tuple[int, FloatArray]] = {}
@@ -106,7 +108,7 @@ class AsynchronousPolicy:
             self._join(stamp_ns)
 
     def _on_transition(self, message: TransitionBatch) -> None:
-        if self.spec is None:
+        if self.spec is None or message.session == self.refused_session:
             return
         shape = (self.spec.num_envs, self.spec.state_dim)
         states = floats(message.next_state, shape, "next_state")
