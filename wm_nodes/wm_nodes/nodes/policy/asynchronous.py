@@ -60,7 +60,7 @@ class AsynchronousPolicy:
         self._outgoing = threading.Lock()
         self._stopped, self._stops = stopped, 0
         self.spec: EnvironmentSpec | None = None
-        self.refused_session = 0
+        self.refused_session: int | None = None
         """Of the environment that sent another robot's spec; nothing is done on its states."""
         self._changed = threading.Condition()
         self._images: dict[int, UInt8Array] = {}
