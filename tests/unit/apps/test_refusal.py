@@ -16,7 +16,7 @@ from wm_nodes.world_model.validation.acceptance_report import AcceptanceReport
 def test_it_is_told_to_stay_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = load_config("cpu", {"acceptance.success_margin": 0.5})
     wins = np.repeat([True, False], [59, 5])
-    clone = CloneRollouts(np.ones(64, np.bool_), wins)
+    clone = CloneRollouts(np.ones(64, np.bool_), wins, wins)
 
     def judged(*given: Any, **_: Any) -> AcceptanceReport:
         return accept_video_model(config, given[3], given[4], clone)

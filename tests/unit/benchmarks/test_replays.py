@@ -24,12 +24,13 @@ def test_a_clone_is_replayed_in_every_split_and_a_policy_that_was_never_trained_
     assert main([*words, "--trainings", "sft"]) == 0
     (row,) = json.loads(file.read_text(encoding="utf-8"))["rows"]
     assert row["replays"].keys() == {"train", "ood_object", "ood_combo"}
-    assert all(len(found["imagined"]) == len(found["replayed"]) == 2 for found in row["replays"].values())
+    assert all([len(them) for them in found.values()] == [2, 2, 2] for found in row["replays"].values())
     assert "imagined successes that are real" in capsys.readouterr().out
     assert main([*words, "--trainings", "world_model"]) == 2
     assert "holds no policies of the training 'world_model'" in capsys.readouterr().err
 
 
 def test_the_share_is_of_the_imagined_successes() -> None:
-    assert of_split({"imagined": [1, 1, 0, 1], "replayed": [1, 0, 1, 1]}).startswith("2 of 3: 67 % [")
-    assert of_split({"imagined": [0, 0], "replayed": [1, 0]}) == "none"
+    found = of_split({"imagined": [1, 1, 0, 1], "replayed": [1, 0, 1, 1], "held": [1, 1, 1, 1]})
+    assert found.startswith("2 of 3: 67 % [") and found.endswith("held 3")
+    assert of_split({"imagined": [0, 0], "replayed": [1, 0], "held": [1, 1]}) == "none"

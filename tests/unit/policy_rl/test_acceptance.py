@@ -4,12 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from graph.toy import ReachToy, make_policy
+from graph.toy import GOAL_M, ReachToy, make_policy
 from model_folders import make_model_folder, make_stepped_folder
 from unit.policy_rl.test_exploit_meter import SEEDS, ToyModel
 
 from wm_nodes.config.load import load_config
+from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt64Array
 from wm_nodes.policy_rl import factories
+from wm_nodes.policy_rl.validation import exploit_meter
 from wm_nodes.policy_rl.validation.acceptance import accept_model, acceptance_when_made
 from wm_nodes.policy_rl.validation.exploit_meter import imagine_and_replay, measure_exploit
 
@@ -19,11 +21,37 @@ CONFIG = load_config("smoke", {"data.num_workers": 1, "acceptance.num_episodes":
 def test_imagined_and_replayed_success_are_those_of_a_reading_of_every_start() -> None:
     policy, model = make_policy(load_config("smoke")), ToyModel(4, 0)
     model.claims = True
-    imagined, replayed = imagine_and_replay(policy, model, ReachToy(1, 0), SEEDS, 0)
+    imagined, replayed, held = imagine_and_replay(policy, model, ReachToy(1, 0), SEEDS, 0)
     whole = measure_exploit(policy, model, ReachToy(3, 0), SEEDS, len(SEEDS), 0)
     np.testing.assert_array_equal(imagined, whole.imagined)
     np.testing.assert_array_equal(replayed, whole.replayed)
     assert imagined.all() and 0 < replayed.sum() < len(SEEDS)
+    np.testing.assert_array_equal(held, replayed)
+
+
+class _Lagging(ReachToy):
+    """Does what it was told a step before."""
+
+    def reset(self, mask: BoolArray | None = None, seeds: UInt64Array | None = None) -> Observation:
+        self._told = np.zeros((1, 3), np.float32)
+        return super().reset(mask, seeds)
+
+    def step(self, actions: FloatArray) -> StepResult:
+        told, self._told = self._told, actions
+        return super().step(told)
+
+
+def test_a_success_that_the_model_sees_too_early_is_real_where_the_robot_holds_still(
+    monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def towards_goal(policy: object, observation: Observation) -> FloatArray:
+        return np.clip((GOAL_M - observation.state) / 0.03, -1, 1)
+
+    monkeypatch.setattr(exploit_meter, "act_in_rows", towards_goal)
+    policy, model = make_policy(load_config("smoke")), ToyModel(4, 0)
+    imagined, replayed, held = imagine_and_replay(policy, model, _Lagging(1, 0), SEEDS, 0)
+    assert imagined.all() and replayed.sum() < len(SEEDS) / 2
+    np.testing.assert_array_equal(held, imagined)
 
 
 def test_starts_that_the_simulator_does_not_show_are_refused_without_pictures_too() -> None:

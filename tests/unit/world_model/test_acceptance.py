@@ -141,7 +141,8 @@ def test_the_table_shows_every_criterion_and_the_remedy_of_a_failed_one() -> Non
 def clone(hits: int, false: int, missed: int, others: int = 0) -> CloneRollouts:
     """Rollouts by how many are imagined and replayed successes, imagined ones alone, replayed ones alone, neither."""
     counts = [hits, false, missed, others]
-    return CloneRollouts(np.repeat([True, True, False, False], counts), np.repeat([True, False, True, False], counts))
+    replayed = np.repeat([True, False, True, False], counts)
+    return CloneRollouts(np.repeat([True, True, False, False], counts), replayed, replayed)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,8 @@ from wm_nodes.reports.console_table import make_table
 @dataclass(kw_only=True)
 class Replays(Configured):
     """How many of a policy's successes in the world model are real: it plays evaluation.episodes first frames of the
-    training scenes, of unseen objects and of unseen combinations there, and the simulator replays its actions."""
+    training scenes, of unseen objects and of unseen combinations there, and the simulator replays its actions; also
+    where the robot then holds still for three steps."""
 
     preset: str = "fair_start"
     """Of the settings: a name, or a .yaml."""
@@ -52,10 +53,13 @@ class Replays(Configured):
 
 
 def of_split(found: dict[str, list[int]]) -> str:
-    """Real and imagined successes among the starts, and the share of the imagined ones that are real."""
-    real = [again for again, seen in zip(found["replayed"], found["imagined"], strict=True) if seen]
+    """Real and imagined successes among the starts, the share of the imagined ones that are real, and how many are real
+    where the robot then holds still."""
+    real, late = ([again for again, seen in zip(found[name], found["imagined"], strict=True) if seen]
+                  for name in ("replayed", "held"))
     share, low, high = wilson_of_share(real)
-    return f"{sum(real)} of {len(real)}: {100 * share:.0f} % [{100 * low:.0f}, {100 * high:.0f}]" if real else "none"
+    text = f"{sum(real)} of {len(real)}: {100 * share:.0f} % [{100 * low:.0f}, {100 * high:.0f}], held {sum(late)}"
+    return text if real else "none"
 
 
 def _row(place: Workplace, training: str) -> Iterator[dict[str, Any]]:
@@ -79,4 +83,4 @@ def _replayed(place: Workplace, policy: ImagePolicy, scenes: str) -> dict[str, l
     starts = folder / "starts.safetensors"
     write_starts(collect_plan(plan, config, folder), starts)
     found = roll_out(config, place.model_dir, policy, starts)
-    return {name: getattr(found, name).astype(int).tolist() for name in ("imagined", "replayed")}
+    return {name: getattr(found, name).astype(int).tolist() for name in ("imagined", "replayed", "held")}

@@ -32,7 +32,7 @@ from wm_nodes.config.schema import PolicyInputs
 from wm_nodes.config.tasks import parts_of
 from wm_nodes.core.statistics import t_interval
 
-REWARDS, RECOVERIES = "roboscape_rewards.json", "roboscape_recoveries.json"
+REWARDS, RECOVERIES, BETTER = (f"roboscape_{name}.json" for name in ("rewards", "recoveries", "better_clones"))
 TRAINED = tuple(f"roboscape_{name}.json" for name in ("table1", "more", "tasks", "state"))
 PPO, CLONES, EXTREME, SEVERAL, UNAIDED = (
     f"roboscape_{name}.json" for name in ("ppo", "clones", "extreme_actions", "table2", "no_positions")
@@ -87,6 +87,13 @@ def table_1_gains() -> Rows:
     ):
         if text := gain([*trained(training, task, inputs), *trained(base, task, inputs)], base, training):
             yield task, inputs, PAYS[training], LABELS[base], text
+
+
+def better_clones() -> Rows:
+    for row in read(BETTER)["rows"]:
+        accepted = row["acceptance"]["outcome"] if "acceptance" in row else ""
+        yield (row["task"], row["seed"], _shown_to(row), LABELS[row["model"]],
+               *(f"{success_of(row, domain):.1f}" for domain in DOMAINS), accepted)
 
 
 def figure_2() -> Rows:

@@ -33,7 +33,7 @@ def section(
         raise ValueError(f"{title}: a row must have {len(heads)} cells, got {wrong[0]}")
     text = [f"## {title}", "", *(f"| {' | '.join(map(str, row))} |" for row in table), ""]
     sources = [f"- Command: `{command}`"] * bool(command) + ([*map(recorded, files)] or [BY_HAND])
-    return "\n".join([*text, *[about, ""] * bool(about), *sources, ""])
+    return "\n".join([*text, *[about.replace("\n", "\n\n"), ""] * bool(about), *sources, ""])
 
 
 def lines(name: str) -> list[Run]:

@@ -59,6 +59,8 @@ class CloneRollouts:
     """(E,), success by the model's own done signal."""
     replayed: BoolArray
     """(E,), success by the simulator, under the same actions."""
+    held: BoolArray
+    """(E,), the same where the robot then holds still for a few steps."""
 
 
 def model_metrics(models: WorldModels, heldout: EpisodeArrays, config: RunConfig) -> dict[str, float]:
