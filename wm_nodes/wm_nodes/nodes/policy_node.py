@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from rclpy.duration import Duration
 from std_msgs.msg import Bool
 
 from wm_msgs.action import Rollout
@@ -29,6 +28,7 @@ from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.clients import EnvironmentClient, LocalEnvironmentClient, RosEnvironmentClient
 from wm_nodes.ros.endpoint_matching import StartBarrier
 from wm_nodes.ros.lifecycle import ManagedNode
+from wm_nodes.ros.liveliness import LAST_WORD_ARRIVES
 from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.qos import LIVE_ACTION
 from wm_nodes.ros.spin import run_node
@@ -36,7 +36,6 @@ from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand
 from wm_nodes.ros.worker import Work
 
 FEEDBACK_S = 0.5
-HOLD_ARRIVES = Duration(seconds=1)
 
 PARAMS = (
     Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
@@ -109,7 +108,7 @@ class PolicyNode(ManagedNode):
         if self._asynchronous is not None:
             self._asynchronous.stop()
             self._publish_hold()
-            self._actions.publisher.wait_for_all_acked(HOLD_ARRIVES)  # a publisher that is gone delivers nothing
+            self._actions.publisher.wait_for_all_acked(LAST_WORD_ARRIVES)
 
     def update_diagnostics(self) -> None:
         if hasattr(self, "_holder"):

@@ -30,6 +30,7 @@ crowded machine, or in the middleware, where `kill -9` of a node can hold all it
 AWAKE_S = 2 * HEARTBEAT_S
 """After it stood still a process takes what has come meanwhile; a peer of which nothing has come by then is lost."""
 LAST_WORD_ARRIVES = Duration(seconds=1.0)
+"""How long a node that leaves waits for who hears it: a publisher that is gone delivers nothing."""
 BUSY_FACTOR = 5
 """How many times the timeout a process may be silent that is seen to compute."""
 
