@@ -19,7 +19,7 @@ def test_it_is_told_to_stay_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyP
     clone = CloneRollouts(np.ones(64, np.bool_), wins, wins)
 
     def judged(*given: Any, **_: Any) -> AcceptanceReport:
-        return accept_video_model(config, given[3], given[4], clone)
+        return accept_video_model(config, given[3], given[4], [clone])
 
     said = list[str]()
     job: Any = SimpleNamespace(config=config, run_dir=tmp_path, video_model="", stage=said.append)

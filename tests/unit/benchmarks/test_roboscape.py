@@ -90,7 +90,8 @@ def test_every_training_is_made_once_and_measured_in_and_out_of_domain(
     monkeypatch.setattr(roboscape, "train_on", train)
     short = {"simulation.max_episode_steps": 20, "evaluation.episodes": 1, "acceptance.num_episodes": 2,
              "imagined_environment.picture_noise": 0.01, "policy.inputs": "latents",
-             "acceptance.clone_episodes": 2, "data.num_workers": 1, "sft.num_demonstrations": 1, "ppo.updates": 1,
+             "acceptance.clone_episodes": 2, "acceptance.clone_scenes": ["ood_object"],
+             "data.num_workers": 1, "sft.num_demonstrations": 1, "ppo.updates": 1,
              "tokenizer.foreground": "background", "ppo.num_steps": 20, "model_refresh.episodes_per_round": 1,
              "model_refresh.heldout_episodes": 2, "model_refresh.replay_episodes": 1,
              "model_refresh.refresh_iterations": 1, "model_refresh.own_starts": 0}
@@ -106,6 +107,8 @@ def test_every_training_is_made_once_and_measured_in_and_out_of_domain(
     assert [one["model"] for one in rows] == [SFT, ONE_SCENE, ALL_SCENES, MODEL, JUDGE, REFRESHED]
     assert all(one["success"].keys() == {scene_of_seed(0), *OOD} for one in rows)
     assert [len(one["course"]) for one in rows] == [0, 1, 1, 1, 1, 1] and rows[-2]["accepted"] is False
+    asked = [row["name"].split(" (")[0] for row in rows[3]["acceptance"]["criteria"]]
+    assert "done precision, cloned policy, ood_object" in asked
     assert rows[-1]["refresh"]["rows"][-1]["name"] == "done signal right"
     shown = capsys.readouterr().out
     assert "[0.0]" in shown and "RL in the simulator, all training scenes" in shown

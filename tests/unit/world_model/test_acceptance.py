@@ -159,14 +159,25 @@ def clone(hits: int, false: int, missed: int, others: int = 0) -> CloneRollouts:
 def test_the_done_signal_is_judged_on_rollouts_of_the_cloned_policy_too(
     found: CloneRollouts, precision: str, recall: str
 ) -> None:
-    criteria, _ = apply_criteria(GOOD, settings(), 16, (40, 100), (80, 200), found)
+    criteria, _ = apply_criteria(GOOD, settings(), 16, (40, 100), (80, 200), [found])
     own = {row.name.split(",")[0]: row for row in criteria if "cloned policy" in row.name}
     assert (own["done precision"].outcome, own["done recall"].outcome) == (precision, recall)
     assert all(row.interval is not None and row.remedy for row in own.values())
 
 
+def test_in_further_scenes_the_done_signal_is_judged_alone() -> None:
+    elsewhere = replace(clone(30, 15, 25), scenes="ood_object")
+    criteria, _ = apply_criteria(GOOD, settings(), 16, (70, 100), (70, 100), [clone(46, 13, 3), elsewhere])
+    asked = {row.name.split(" (")[0]: row.outcome for row in criteria if "cloned policy" in row.name}
+    assert asked == {
+        "done precision, cloned policy": "undecided", "done recall, cloned policy": "passed",
+        "room to learn: done precision, cloned policy - its real success 70/100": "passed",
+        "done precision, cloned policy, ood_object": "failed", "done recall, cloned policy, ood_object": "undecided",
+    }
+
+
 def test_a_model_that_only_scripted_episodes_speak_for_is_refused_by_the_cloned_policy() -> None:
-    criteria, _ = apply_criteria(GOOD, settings(), 16, (40, 100), (80, 200), clone(40, 40, 10))
+    criteria, _ = apply_criteria(GOOD, settings(), 16, (40, 100), (80, 200), [clone(40, 40, 10)])
     report = AcceptanceReport("push_cube", 96, criteria, GOOD)
     assert report.failed == ("done precision, cloned policy (80)",) and report.words.startswith("failed (done prec")
 
@@ -184,13 +195,13 @@ def test_a_model_that_only_scripted_episodes_speak_for_is_refused_by_the_cloned_
 def test_a_policy_that_the_model_could_only_lower_is_not_trained_in_it(
     real: tuple[int, int], found: CloneRollouts, outcome: str
 ) -> None:
-    criteria, _ = apply_criteria(GOOD, settings(), 16, (90, 100), real, found)
+    criteria, _ = apply_criteria(GOOD, settings(), 16, (90, 100), real, [found])
     room = next(row for row in criteria if row.name.startswith("room to learn"))
     assert room.outcome == outcome and f"{real[0]}/{real[1]}" in room.name and "keep this policy" in room.remedy
 
 
 def test_a_policy_that_mostly_fails_has_nothing_to_keep() -> None:
-    criteria, _ = apply_criteria(GOOD, settings(), 16, (90, 100), (32, 100), clone(2, 10, 3))
+    criteria, _ = apply_criteria(GOOD, settings(), 16, (90, 100), (32, 100), [clone(2, 10, 3)])
     assert not [row for row in criteria if row.name.startswith("room to learn")], "RL in the model won 19 points"
 
 

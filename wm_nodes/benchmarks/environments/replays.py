@@ -1,7 +1,7 @@
 """How many of a policy's successes in the world model are successes in the simulator, in scenes of every split."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,8 @@ from wm_nodes.config.scenes import splits
 from wm_nodes.config.seed_ranges import NEW_CONTEXTS
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.statistics import wilson_of_share
-from wm_nodes.environments.record import collect_plan, first_frames_plan
 from wm_nodes.policy_rl.image_policy import ImagePolicy
-from wm_nodes.policy_rl.initial_policy import write_starts
-from wm_nodes.policy_rl.validation.acceptance import roll_out
+from wm_nodes.policy_rl.validation.acceptance import in_scenes, roll_out
 from wm_nodes.reports.console_table import make_table
 
 
@@ -77,10 +75,6 @@ def _weights(folder: Path, training: str) -> Path:
 
 
 def _replayed(place: Workplace, policy: ImagePolicy, scenes: str) -> dict[str, list[int]]:
-    config = place.config.with_values(simulation=place.config.simulation.with_values(scenes=scenes))
-    count, folder = config.evaluation.episodes, place.folder / "replays" / scenes
-    plan = replace(first_frames_plan(config, count), first_seed=NEW_CONTEXTS.take(count))
-    starts = folder / "starts.safetensors"
-    write_starts(collect_plan(plan, config, folder), starts)
-    found = roll_out(config, place.model_dir, policy, starts)
+    count, folder = place.config.evaluation.episodes, place.folder / "replays" / scenes
+    found = roll_out(*in_scenes(place.config, scenes, count, NEW_CONTEXTS, folder), place.model_dir, policy)
     return {name: getattr(found, name).astype(int).tolist() for name in ("imagined", "replayed", "held")}

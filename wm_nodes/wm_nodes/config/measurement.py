@@ -4,6 +4,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from wm_nodes.config.environments import ScenesName
 from wm_nodes.config.sections import (
     EnvironmentName,
     Fraction,
@@ -49,6 +50,9 @@ class AcceptanceConfig(SettingsSection):
     clone_episodes: NonNegativeInt = 0
     """Held-out first frames from which the cloned policy is rolled out, its actions then replayed in the simulator; 0:
     none."""
+    clone_scenes: list[ScenesName] = Field(default=[])
+    """Further scenes of a task that has many, each a value of simulation.scenes, of which as many first frames are
+    taken: the done signal must be right there, too."""
     goal_error_ratio: PositiveFloat = 1.0
     """Where goals are rewards: errors of imagined goals must be below this share of those of the first frame."""
     success_margin: PositiveFloat = 1.0

@@ -94,10 +94,10 @@ def recovery_plan(config: RunConfig, make_policy: Callable[[], PolicyAct], plann
     return replace(plan, behaviours={}, make_policy=make_policy, recovers=True)
 
 
-def first_frames_plan(config: RunConfig, num_episodes: int) -> CollectionPlan:
+def first_frames_plan(config: RunConfig, num_episodes: int, seeds: SeedRange = STARTS) -> CollectionPlan:
     """Return the plan of episodes of one step: first frames to imagine from."""
     one_step = config.simulation.model_copy(update={"max_episode_steps": 1})
-    return CollectionPlan(config.task, one_step, num_episodes, STARTS.take(num_episodes), behaviours={"random": 1.0})
+    return CollectionPlan(config.task, one_step, num_episodes, seeds.take(num_episodes), behaviours={"random": 1.0})
 
 
 def collect_plan(plan: CollectionPlan, config: RunConfig, folder: Path) -> list[Path]:

@@ -1,9 +1,12 @@
 """Acceptance of the model that a policy is about to be trained in: a part of every training beside a simulator."""
 
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.environments.record import acceptance_plan, collect_plan, keep_plan
+from wm_nodes.config.seed_ranges import HELDOUT, SeedRange
+from wm_nodes.environments.record import acceptance_plan, collect_plan, first_frames_plan, keep_plan
 from wm_nodes.environments.registry import is_simulated, make_environment
 from wm_nodes.policy_rl.device_rollout import unseen_pictures_left_out
 from wm_nodes.policy_rl.factories import STARTS, make_imagined_environment, make_video_environment, models_of
@@ -44,7 +47,7 @@ def accept_model(
     folder.mkdir(parents=True, exist_ok=True)
     keep_plan(plan, folder)
     bags = collect_plan(plan, config, folder)
-    clone = _roll_out(config, model_dir, policy, bags, folder, video_model_dir)
+    clone = tuple(_roll_out(config, model_dir, policy, bags, folder, video_model_dir))
     if video_model_dir is not None:
         return accept_video_model(config, imagined, real, clone)
     models = models_of(model_dir, config.device)
@@ -61,17 +64,29 @@ def acceptance_when_made(model_dir: Path | None, config: RunConfig) -> str:
 def _roll_out(
     config: RunConfig, model_dir: Path, policy: ImagePolicy, bags: list[Path], folder: Path,
     video_model_dir: Path | None,
-) -> CloneRollouts | None:
-    """Rollouts of the policy from the first frames of held-out episodes; None where acceptance.clone_episodes is 0."""
-    if not config.acceptance.clone_episodes:
-        return None
+) -> Iterator[CloneRollouts]:
+    """Rollouts of the policy from the first frames of held-out episodes, and of each of acceptance.clone_scenes."""
+    count, starts = config.acceptance.clone_episodes, folder / STARTS
+    if not count:
+        return
+    write_starts(bags, starts, count)
+    yield roll_out(config, starts, model_dir, policy, video_model_dir)
+    for scenes in config.acceptance.clone_scenes if config.simulation.scenes else ():
+        there = in_scenes(config, scenes, count, HELDOUT, folder / scenes)
+        yield replace(roll_out(*there, model_dir, policy, video_model_dir), scenes=scenes)
+
+
+def in_scenes(config: RunConfig, scenes: str, count: int, seeds: SeedRange, folder: Path) -> tuple[RunConfig, Path]:
+    """The configuration of the task in other scenes, a value of simulation.scenes, and a file of `count` first frames
+    there, collected below `folder`; those that are there are kept."""
+    config = config.with_values(simulation=config.simulation.with_values(scenes=scenes))
     starts = folder / STARTS
-    write_starts(bags, starts, config.acceptance.clone_episodes)
-    return roll_out(config, model_dir, policy, starts, video_model_dir)
+    write_starts(collect_plan(first_frames_plan(config, count, seeds), config, folder), starts)
+    return config, starts
 
 
 def roll_out(
-    config: RunConfig, model_dir: Path, policy: ImagePolicy, starts: Path, video_model_dir: Path | None = None
+    config: RunConfig, starts: Path, model_dir: Path, policy: ImagePolicy, video_model_dir: Path | None = None
 ) -> CloneRollouts:
     """Play a policy in the model from every start of a file, and its actions again in the simulator."""
     make = make_imagined_environment if video_model_dir is None else make_video_environment

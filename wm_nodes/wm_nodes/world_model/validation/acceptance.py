@@ -8,7 +8,7 @@ rollouts of its own (policy_rl/validation/acceptance.py).
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,6 +61,8 @@ class CloneRollouts:
     """(E,), success by the simulator, under the same actions."""
     held: BoolArray
     """(E,), the same where the robot then holds still for a few steps."""
+    scenes: str = ""
+    """Of the first frames, as simulation.scenes; empty: those that training begins in."""
 
 
 def model_metrics(models: WorldModels, heldout: EpisodeArrays, config: RunConfig) -> dict[str, float]:
@@ -81,14 +83,14 @@ def _sees_states(models: WorldModels, config: RunConfig) -> bool:
 
 def accept_world_model(
     models: WorldModels, heldout: EpisodeArrays, config: RunConfig, imagined: tuple[int, int] | None = None,
-    real: tuple[int, int] | None = None, clone: CloneRollouts | None = None,
+    real: tuple[int, int] | None = None, clone: Sequence[CloneRollouts] = (),
 ) -> AcceptanceReport:
     """Measure whether a world model passes acceptance for config.task.
 
     Args:
         heldout: real episodes that the model was not trained on; without ground truth, positions are not judged.
         imagined, real: (successes, episodes) of the SFT policy in the model and in the simulator; None: not measured.
-        clone: of the SFT policy; None: not measured.
+        clone: of the SFT policy, each of other scenes; empty: not measured.
 
     Raises:
         ValueError: some episodes without ground truth, or labelled for other tasks than the model's.
@@ -108,7 +110,7 @@ def accept_world_model(
 
 def apply_criteria(
     metrics: Mapping[str, float | None], config: RunConfig, num_steps: int, imagined: tuple[int, int] | None,
-    real: tuple[int, int] | None, clone: CloneRollouts | None = None, *, told: bool = False,
+    real: tuple[int, int] | None, clone: Sequence[CloneRollouts] = (), *, told: bool = False,
 ) -> tuple[tuple[Criterion, ...], tuple[str, ...]]:
     """Return criteria and notes from the metrics of rollouts of up to num_steps steps; see accept_world_model.
 
@@ -205,7 +207,7 @@ def _position_criteria(
 
 
 def accept_video_model(
-    config: RunConfig, imagined: tuple[int, int], real: tuple[int, int], clone: CloneRollouts | None = None
+    config: RunConfig, imagined: tuple[int, int], real: tuple[int, int], clone: Sequence[CloneRollouts] = ()
 ) -> AcceptanceReport:
     """Judge a model that cannot be rolled out as accept_world_model does, by what the SFT policy does in it alone."""
     criteria, notes = _policy_criteria(config, imagined, real, clone)
@@ -226,7 +228,7 @@ def report_when_made(
         config = config.model_copy(update={"task": task})
     metrics = held.get(task, held)
     if f"tool_ratio_h{steps:02d}" not in metrics and not horizons_of(metrics):
-        of_policy, left_out = _policy_criteria(config, imagined, real, None)
+        of_policy, left_out = _policy_criteria(config, imagined, real)
         note = f"the model's manifest holds no metrics of held-out episodes of {task}"
         return AcceptanceReport(task, 0, tuple(of_policy), {}, (note, *left_out))
     told = config.policy.inputs == "state" and bool(manifest.get("world_model", {}).get("state_model_iterations"))
@@ -252,19 +254,22 @@ def accepted_when_made(manifest: Mapping[str, Any], config: RunConfig) -> str:
 
 
 def _policy_criteria(
-    config: RunConfig, imagined: tuple[int, int] | None, real: tuple[int, int] | None, clone: CloneRollouts | None
+    config: RunConfig, imagined: tuple[int, int] | None, real: tuple[int, int] | None,
+    clone: Sequence[CloneRollouts] = (),
 ) -> tuple[list[Criterion], list[str]]:
     """Criteria and notes of what the SFT policy does in the model."""
     limits, criteria, notes = config.acceptance, list[Criterion](), list[str]()
-    if clone is None:
+    if not clone:
         notes.append("The done signal was not judged on rollouts of the cloned policy: none were made.")
-    else:
+    for found in clone:
+        who = f"cloned policy, {found.scenes}" if found.scenes else "cloned policy"
+        right, seen = found.replayed[found.imagined], found.imagined[found.replayed]
         criteria += [
-            _of_clone("precision", clone.replayed[clone.imagined], limits.done_precision, config, MORE_NEAR_MISSES),
-            _of_clone("recall", clone.imagined[clone.replayed], limits.done_recall, config, MORE_SUCCESSES),
+            _of_clone(f"precision, {who}", right, limits.done_precision, config, MORE_NEAR_MISSES),
+            _of_clone(f"recall, {who}", seen, limits.done_recall, config, MORE_SUCCESSES),
         ]
-        if real is not None and 2 * real[0] >= real[1]:
-            criteria.append(_room(clone.replayed[clone.imagined], real, limits.success_margin))
+        if not found.scenes and real is not None and 2 * real[0] >= real[1]:
+            criteria.append(_room(right, real, limits.success_margin))
     if not limits.require_success_agreement:
         notes.append("Agreement of imagined and real success was not asked for (acceptance.require_success_agreement).")
     elif imagined is None or real is None:
@@ -304,11 +309,11 @@ def _room(right: BoolArray, real: tuple[int, int], margin: float) -> Criterion:
     return Criterion(name, gap, 0.0, f"interval above {-margin:g}, value >=", outcome, GOOD_ALREADY, (low, high))
 
 
-def _of_clone(kind: str, right: BoolArray, limit: float, config: RunConfig, remedy: str) -> Criterion:
+def _of_clone(what: str, right: BoolArray, limit: float, config: RunConfig, remedy: str) -> Criterion:
     """See _of_interval."""
     value, low, high = wilson_of_share(right)
     outcome, rule = _of_interval(value, low, high, limit, config.acceptance.success_margin)
-    return Criterion(f"done {kind}, cloned policy ({len(right)})", value, limit, rule, outcome, remedy, (low, high))
+    return Criterion(f"done {what} ({len(right)})", value, limit, rule, outcome, remedy, (low, high))
 
 
 def _of_interval(value: float, low: float, high: float, limit: float, margin: float) -> tuple[Outcome, str]:
