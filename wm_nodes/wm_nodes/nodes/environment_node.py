@@ -33,7 +33,6 @@ from wm_nodes.recording.messages import tiles_of
 from wm_nodes.ros import calls, convert, diagnostics
 from wm_nodes.ros.flow_control import ProducerCredits
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.liveliness import LAST_WORD_ARRIVES
 from wm_nodes.ros.params import Param
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import EpisodeNote
@@ -134,7 +133,6 @@ class EnvironmentNode(ManagedNode):
         if self.served is not None:
             self._hold()
             self.served.end_episodes(EpisodeEvent.REASON_DEACTIVATED)
-            self._episodes.publisher.wait_for_all_acked(LAST_WORD_ARRIVES)
 
     def cleanup(self) -> None:
         served, self.served = self.served, None

@@ -28,7 +28,6 @@ from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.clients import EnvironmentClient, LocalEnvironmentClient, RosEnvironmentClient
 from wm_nodes.ros.endpoint_matching import StartBarrier
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.liveliness import LAST_WORD_ARRIVES
 from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.qos import LIVE_ACTION
 from wm_nodes.ros.spin import run_node
@@ -108,7 +107,6 @@ class PolicyNode(ManagedNode):
         if self._asynchronous is not None:
             self._asynchronous.stop()
             self._publish_hold()
-            self._actions.publisher.wait_for_all_acked(LAST_WORD_ARRIVES)
 
     def update_diagnostics(self) -> None:
         if hasattr(self, "_holder"):

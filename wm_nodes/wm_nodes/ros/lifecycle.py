@@ -28,7 +28,7 @@ from wm_nodes.ros.flow_control import ConsumerCredits
 from wm_nodes.ros.guard import Guard
 from wm_nodes.ros.liveliness import HEARTBEAT_S, Heartbeat, PeerWatch
 from wm_nodes.ros.params import COMMON, Param, declare, refusal
-from wm_nodes.ros.publishing import StampedPublisher
+from wm_nodes.ros.publishing import OwnPublishers, StampedPublisher
 from wm_nodes.ros.qos import VIEW, topic
 from wm_nodes.ros.sequence_numbers import GapTracker, new_session
 
@@ -63,6 +63,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self.actions: list[Any] = []
         """The ros.actions.WorkerActions that it serves."""
         self._entities: list[Callable[[], object]] = []
+        self._own_publishers = OwnPublishers(self)
         self._trackers: dict[str, GapTracker] = {}
         self._introspected: list[Any] = []
         declare(self, (*COMMON, *params))
@@ -160,16 +161,11 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     def publish_on(self, name: str, qos: QoSProfile | None = None) -> StampedPublisher:
         """A numbering publisher for a row of the QoS table (or another profile), destroyed at cleanup."""
-        publisher = StampedPublisher(self, name, self.session, qos)
-        self.own(self.destroy_publisher, publisher.publisher)
-        return publisher
+        return self._own_publishers.numbering(name, self.session, qos)
 
     def publish_unnumbered(self, name: str) -> Publisher:
         """A publisher for a row of the QoS table whose messages have no (session, seq), destroyed at cleanup."""
-        row = topic(name)
-        publisher = self.create_publisher(row.type, row.name, row.qos)
-        self.own(self.destroy_publisher, publisher)
-        return publisher
+        return self._own_publishers.plain(name)
 
     def watch(self, prefix: str) -> None:
         """Hear the heartbeats of the nodes of a relative namespace, too, until cleanup: their silence is reported."""
@@ -350,6 +346,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self._introspected.clear()
         while self._entities:
             self._entities.pop()()
+        self._own_publishers.end()
         self._trackers.clear()
 
     # Heartbeat and diagnostics.

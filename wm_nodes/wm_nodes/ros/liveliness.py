@@ -13,13 +13,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rclpy.duration import Duration
-
 from wm_msgs.msg import ErrorCode, RunState
 from wm_nodes.core.errors import WireError
 from wm_nodes.core.processes import Activity, ActivityWatch
 from wm_nodes.ros import diagnostics
 from wm_nodes.ros.guard import check_sender
+from wm_nodes.ros.publishing import wait_until_heard
 from wm_nodes.ros.qos import topic
 
 HEARTBEAT_S = 0.5
@@ -29,8 +28,6 @@ crowded machine, or in the middleware, where `kill -9` of a node can hold all it
 264 kills)."""
 AWAKE_S = 2 * HEARTBEAT_S
 """After it stood still a process takes what has come meanwhile; a peer of which nothing has come by then is lost."""
-LAST_WORD_ARRIVES = Duration(seconds=1.0)
-"""How long a node that leaves waits for who hears it: a publisher that is gone delivers nothing."""
 BUSY_FACTOR = 5
 """How many times the timeout a process may be silent that is seen to compute."""
 
@@ -147,7 +144,7 @@ class Heartbeat:
             state: RunState.FINISHED or FAILED.
         """
         self.publish(state, "stopped")
-        self._publisher.wait_for_all_acked(LAST_WORD_ARRIVES)
+        wait_until_heard(self._publisher)
 
     def publish(self, state: int, detail: str) -> None:
         """state: a constant of RunState."""
