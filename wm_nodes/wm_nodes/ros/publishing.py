@@ -1,4 +1,4 @@
-"""The publishers of a node: some number their messages, and none goes before its last one has arrived."""
+"""The publishers of a node: some number their messages, and all wait a while for the last ones to arrive."""
 
 import time
 from typing import Any

@@ -81,7 +81,7 @@ def in_scenes(config: RunConfig, scenes: str, count: int, seeds: SeedRange, fold
     there, collected below `folder`; those that are there are kept."""
     config = config.with_values(simulation=config.simulation.with_values(scenes=scenes))
     starts = folder / STARTS
-    write_starts(collect_plan(first_frames_plan(config, count, seeds), config, folder), starts)
+    write_starts(collect_plan(first_frames_plan(config, count, seeds), config, folder), starts, count)
     return config, starts
 
 
