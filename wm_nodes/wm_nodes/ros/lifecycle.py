@@ -28,7 +28,7 @@ from wm_nodes.ros.flow_control import ConsumerCredits
 from wm_nodes.ros.guard import Guard
 from wm_nodes.ros.liveliness import HEARTBEAT_S, Heartbeat, PeerWatch
 from wm_nodes.ros.params import COMMON, Param, declare, refusal
-from wm_nodes.ros.publishing import OwnPublishers, StampedPublisher
+from wm_nodes.ros.publishing import StampedPublisher, destroy_when_heard
 from wm_nodes.ros.qos import VIEW, topic
 from wm_nodes.ros.sequence_numbers import GapTracker, new_session
 
@@ -63,7 +63,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self.actions: list[Any] = []
         """The ros.actions.WorkerActions that it serves."""
         self._entities: list[Callable[[], object]] = []
-        self._own_publishers = OwnPublishers(self)
+        self._own_publishers: list[Publisher] = []
         self._trackers: dict[str, GapTracker] = {}
         self._introspected: list[Any] = []
         declare(self, (*COMMON, *params))
@@ -161,11 +161,15 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     def publish_on(self, name: str, qos: QoSProfile | None = None) -> StampedPublisher:
         """A numbering publisher for a row of the QoS table (or another profile), destroyed at cleanup."""
-        return self._own_publishers.numbering(name, self.session, qos)
+        publisher = StampedPublisher(self, name, self.session, qos)
+        self._own_publishers.append(publisher.publisher)
+        return publisher
 
     def publish_unnumbered(self, name: str) -> Publisher:
         """A publisher for a row of the QoS table whose messages have no (session, seq), destroyed at cleanup."""
-        return self._own_publishers.plain(name)
+        row = topic(name)
+        self._own_publishers.append(self.create_publisher(row.type, row.name, row.qos))
+        return self._own_publishers[-1]
 
     def watch(self, prefix: str) -> None:
         """Hear the heartbeats of the nodes of a relative namespace, too, until cleanup: their silence is reported."""
@@ -346,7 +350,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self._introspected.clear()
         while self._entities:
             self._entities.pop()()
-        self._own_publishers.end()
+        destroy_when_heard(self, self._own_publishers)
         self._trackers.clear()
 
     # Heartbeat and diagnostics.

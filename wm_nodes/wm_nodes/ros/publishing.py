@@ -1,4 +1,4 @@
-"""The publishers of a node: some number their messages, and all wait a while for the last ones to arrive."""
+"""Publishers that number their messages, and that end when the last ones have arrived."""
 
 import time
 from typing import Any
@@ -37,32 +37,13 @@ class StampedPublisher:
         self.publisher.publish(message)
 
 
-class OwnPublishers:
-    """The publishers of rows of the QoS table that a node has until end()."""
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self._all: list[Publisher] = []
-
-    def numbering(self, name: str, session: int, qos: QoSProfile | None = None) -> StampedPublisher:
-        """One for a row, or with another profile, whose messages are numbered."""
-        publisher = StampedPublisher(self._node, name, session, qos)
-        self._all.append(publisher.publisher)
-        return publisher
-
-    def plain(self, name: str) -> Publisher:
-        """One for a row whose messages have no (session, seq)."""
-        row = topic(name)
-        self._all.append(self._node.create_publisher(row.type, row.name, row.qos))
-        return self._all[-1]
-
-    def end(self) -> None:
-        """Destroy them once what they sent has arrived, or LAST_WORD_S have passed."""
-        until = time.monotonic() + LAST_WORD_S
-        for publisher in self._all:
-            wait_until_heard(publisher, until - time.monotonic())
-        while self._all:
-            self._node.destroy_publisher(self._all.pop())
+def destroy_when_heard(node: Node, publishers: list[Publisher]) -> None:
+    """Destroy a node's publishers, and empty the list, once what they sent has arrived or LAST_WORD_S have passed."""
+    until = time.monotonic() + LAST_WORD_S
+    for publisher in publishers:
+        wait_until_heard(publisher, until - time.monotonic())
+    while publishers:
+        node.destroy_publisher(publishers.pop())
 
 
 def wait_until_heard(publisher: Publisher, longest_s: float = LAST_WORD_S) -> None:
