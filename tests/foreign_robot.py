@@ -138,13 +138,13 @@ class Run:
 
 def write(
     path: Path, messages: list[Message], plugin: StoragePlugin = StoragePlugin.MCAP,
-    mode: CompressionMode = CompressionMode.NONE,
+    mode: CompressionMode = CompressionMode.NONE, *, as_listed: bool = False,
 ) -> None:
-    """A bag of the messages, as rosbags writes it."""
+    """A bag of the messages, as rosbags writes it. as_listed: in their order, not in that of time."""
     writer, connections = Writer(path, version=9, storage_plugin=plugin), dict[str, Any]()
     writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
-        for time_ns, topic, one in sorted(messages, key=lambda each: each[0]):
+        for time_ns, topic, one in messages if as_listed else sorted(messages, key=lambda each: each[0]):
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, one.__msgtype__, typestore=STORE)
             writer.write(connections[topic], time_ns, STORE.serialize_cdr(one, one.__msgtype__))

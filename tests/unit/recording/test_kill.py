@@ -5,14 +5,18 @@ import re
 import resource
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
+from foreign_robot import message
+from foreign_robot import write as write_foreign
 from mcap.reader import make_reader
 from recording_samples import assert_same_episode, make_episode, make_spec
+from rosbags.rosbag2 import StoragePlugin
 
 from wm_nodes.core.types import Episode
 from wm_nodes.recording import (
@@ -129,7 +133,7 @@ def test_every_episode_written_before_a_kill_is_recovered(tmp_path: Path) -> Non
     found = list(read_episodes(report.bag))
     assert len(found) in (last + 1, last + 2)
     for index, episode in enumerate(found):
-        assert_same_episode(episode, make_episode(make_spec(), index, extra={}))
+        assert_same_episode(episode, make_episode(make_spec(), index))
     with Bag(report.bag) as bag:
         assert bag.custom["wm.run_id"] == "killed"
         assert bag.custom["wm.git_commit"] == "abc"
@@ -220,6 +224,33 @@ def test_the_recover_command_writes_a_bag(tmp_path: Path) -> None:
     assert process.returncode == 0, process.stderr
     assert process.stderr == ""
     assert len(list(read_episodes(tmp_path / "again"))) == 2
+
+
+def test_every_committed_message_of_a_killed_sqlite3_bag_comes_back(tmp_path: Path) -> None:
+    (tmp_path / "plain").mkdir()
+    said = [(n + 1, "/say", message("std_msgs/msg/String", data=f"{n}")) for n in range(10)]
+    write_foreign(tmp_path / "plain" / "bag", said, StoragePlugin.SQLITE3)
+    folder = (tmp_path / "plain").rename(tmp_path / "take#2 50%")
+    (file,) = (folder / "bag").glob("*.db3")
+    database = sqlite3.connect(file)
+    database.execute("PRAGMA journal_mode=WAL")
+    database.execute("PRAGMA wal_autocheckpoint=0")
+    database.execute("UPDATE message_definitions SET encoding = ''")  # as of a definition that was not found
+    database.execute("INSERT INTO messages SELECT id + 10, topic_id, timestamp + 10, data FROM messages")
+    database.commit()
+    shutil.copytree(folder, killed := tmp_path / "killed?")  # before the writer ends, which would empty its log
+    database.close()
+    report = recover(killed / "bag")
+    assert (report.messages, report.damaged) == (20, [])
+    for bag_folder in (folder / "bag", killed / "bag", report.bag):
+        with Bag(bag_folder) as bag:
+            assert [time_ns for _, time_ns, _ in bag.messages(["/say"])] == [*range(1, 21)]
+
+
+def test_what_an_episode_carries_comes_back_with_it(tmp_path: Path) -> None:
+    path = write_episodes(tmp_path / "bag", 3)
+    (path / "metadata.yaml").unlink()
+    assert [episode.extra for episode in read_episodes(recover(path).bag)] == [{"index": n} for n in range(3)]
 
 
 def test_a_full_disk_is_one_clear_error_and_what_was_flushed_is_recoverable(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import cached_property
-from itertools import chain, dropwhile
+from itertools import chain, dropwhile, pairwise
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -18,7 +18,7 @@ from wm_nodes.recording.cdr import session_and_seq
 from wm_nodes.recording.errors import BagError
 from wm_nodes.recording.layout import Tiles
 from wm_nodes.recording.messages import deserialize, spec_from_json, spec_of
-from wm_nodes.recording.raw import PARTIAL_SUFFIX
+from wm_nodes.recording.raw import EPISODE_TABLE, PARTIAL_SUFFIX
 from wm_nodes.recording.typestore import other_type
 
 METADATA = "metadata.yaml"
@@ -95,6 +95,16 @@ class Bag:
     def count(self, topic: str) -> int:
         """Messages recorded on an absolute topic name."""
         return sum(connection.msgcount for connection in self.connections if connection.topic == topic)
+
+    def serialization(self, topic: str) -> str:
+        """Of the messages of a topic; cdr in a bag of ROS 2, empty without the topic."""
+        exts = [c.ext for c in self.connections if c.topic == topic]
+        return next((ext.serialization_format for ext in exts if isinstance(ext, ConnectionExtRosbag2)), "")
+
+    def set_back_ns(self, topic: str) -> int:
+        """By how much the clock of its recorder was set back at most, as the receive times of a topic show, ns."""
+        falls = (earlier - later for file in self._files for earlier, later in pairwise(file.times(topic)))
+        return max(falls, default=0)
 
     def namespace(self, wanted: str | None) -> str:
         """The namespace of the environment to read: `wanted`, or the only one; among several the one that the others
@@ -208,8 +218,8 @@ class Bag:
         return spec_from_json(text) if text else None
 
     def episode_table(self) -> list[dict[str, Any]]:
-        """Rows of wm.episode_table_json; empty where the bag has none (live recording, recovered bag)."""
-        text = self.custom.get("wm.episode_table_json")
+        """Rows of EPISODE_TABLE; empty where the bag has none (live recording)."""
+        text = self.custom.get(EPISODE_TABLE)
         if not text:
             return []
         table = json.loads(text)

@@ -19,6 +19,10 @@ FLUSH_S = 0.5
 """Age at which a chunk is closed."""
 START_RECORD = "wm.start"
 """MCAP metadata record at the start of every file: the custom data known then, so that a kill does not lose them."""
+EPISODE_RECORD = "wm.episode"
+"""MCAP metadata record before the messages of an episode: its row of EPISODE_TABLE, which a kill then does not lose."""
+EPISODE_TABLE = "wm.episode_table_json"
+"""Custom data of a bag of whole episodes: `columns` and `rows`."""
 
 
 class RawBagWriter:
@@ -135,6 +139,13 @@ class RawBagWriter:
         self.flush(only_if_due=True)
         if 0 < self._split_bytes <= self.bytes_in_file or 0 < self._split_s <= time.monotonic() - self._file_started:
             self.split()
+
+    def add_record(self, name: str, values: Mapping[str, str]) -> None:
+        """Write an MCAP metadata record where the file is now."""
+        try:
+            self._open_writer().add_metadata(name, dict(values))
+        except OSError as error:
+            raise self._abort_with(error) from error
 
     def flush(self, *, only_if_due: bool = False) -> None:
         """Hand everything written so far to the operating system; with only_if_due, at most every FLUSH_S.

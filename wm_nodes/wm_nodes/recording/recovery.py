@@ -8,15 +8,15 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import apsw
 from mcap.records import Channel, Message, Metadata, Schema
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import ReaderError
 
 from wm_nodes.recording import storage
 from wm_nodes.recording.errors import BagError
-from wm_nodes.recording.raw import PARTIAL_SUFFIX, START_RECORD, RawBagWriter
+from wm_nodes.recording.raw import EPISODE_RECORD, EPISODE_TABLE, PARTIAL_SUFFIX, START_RECORD, RawBagWriter
 from wm_nodes.recording.storage import Note
 
 
@@ -59,30 +59,39 @@ def recover(path: Path, *, output: Path | None = None) -> RecoverReport:
         raise BagError(f"no .mcap file at {path}, nor a .db3 file; give the .partial folder, a bag folder or a file")
     target = output if output is not None else _default_output(path)
     damaged: list[str] = []
-    writer = RawBagWriter(target, custom={"wm.recovered_from": str(path)})
+    writer, rows = RawBagWriter(target, custom={"wm.recovered_from": str(path)}), list[dict[str, Any]]()
     try:
         with TemporaryDirectory(prefix="wm_bag_") as scratch:
             for file in files:
                 plain = storage.unpacked(file, Path(scratch), damaged.append)
-                (_copy_rows if storage.is_sqlite3(plain) else _copy_records)(plain, writer, damaged.append)
+                if storage.is_sqlite3(plain):
+                    _copy_rows(plain, writer, damaged.append)
+                else:
+                    _copy_records(plain, writer, rows, damaged.append)
         if not writer.messages:
             raise BagError(f"{path} holds no complete message; nothing to recover ({'; '.join(damaged) or 'empty'})")
     except BaseException:
         writer.abort(remove=True)
         raise
+    if rows:
+        table = {"columns": [*rows[0]], "rows": [[*row.values()] for row in rows]}
+        writer.custom[EPISODE_TABLE] = json.dumps(table)
     writer.custom["wm.recover_report_json"] = json.dumps({"damaged": damaged})
     counts = {name: info.messages for name, info in writer.topics.items()}
     messages = writer.messages
     return RecoverReport(path, writer.close(), messages, counts, damaged)
 
 
-def _copy_records(file: Path, writer: RawBagWriter, note: Note) -> None:
+def _copy_records(file: Path, writer: RawBagWriter, rows: list[dict[str, Any]], note: Note) -> None:
+    """rows: gets those of the episodes, see raw.EPISODE_RECORD."""
     schemas: dict[int, Schema] = {}
     names: dict[int, str] = {}
     for record in storage.scan_mcap(file, note):
         if isinstance(record, Metadata) and record.name == START_RECORD:
             for key, value in record.metadata.items():
                 writer.custom.setdefault(key, value)
+        elif isinstance(record, Metadata) and record.name == EPISODE_RECORD:
+            rows.append(json.loads(record.metadata["row"]))
         elif isinstance(record, Schema):
             schemas[record.id] = record
         elif isinstance(record, Channel):
@@ -100,7 +109,7 @@ def _copy_rows(file: Path, writer: RawBagWriter, note: Note) -> None:
             names = [c.topic for c in opened.connections if _copy_topic(c, writer, note)]
             for topic, time_ns, data in opened.in_file(names, note):
                 writer.write(topic, data, time_ns)
-    except (ReaderError, apsw.Error, UnicodeDecodeError) as error:
+    except (apsw.Error, UnicodeDecodeError) as error:
         note(f"{file.name}: {error}")
 
 

@@ -2,12 +2,15 @@
 read from the file itself, since metadata.yaml may say less (after a re-indexing) or something else."""
 
 import heapq
+import shutil
 import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import apsw
 import zstandard
@@ -20,7 +23,6 @@ from mcap.summary import Summary
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat, Qos
 from rosbags.rosbag2 import ReaderError
 from rosbags.rosbag2.metadata import parse_qos
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 RECORD_LIMIT_BYTES = 2**30
@@ -29,6 +31,9 @@ DAMAGE = (McapError, struct.error, ValueError, OSError, OverflowError, MemoryErr
 
 _MCAP, _SQLITE3, _ZSTD = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 _RECORD_HEADER_BYTES = 9
+_FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
+_TOPIC = ("id", "name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash")
+_DEFINITION = ("topic_type", "encoding", "encoded_message_definition")
 
 Note = Callable[[str], None]
 """Told of each damaged part, which is then left out, unless it raises."""
@@ -152,19 +157,46 @@ class McapFile:
 
 
 class Sqlite3File:
-    """An sqlite3 file of rosbag2, opened for reading; as McapFile."""
+    """An sqlite3 file of rosbag2, opened for reading; as McapFile. Of whichever version: columns that it lacks are
+    empty, and a definition that its recorder did not find is none."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._reader = Sqlite3Reader(path)
-        self._reader.open()
-        self.connections = list(self._reader.connections)
-        information = self._reader.metadata
-        self.start_ns = information.start_time if information.message_count else None
-        self.end_ns = information.end_time - 1 if information.message_count else None
+        flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
+        self._database = apsw.Connection(f"file:{quote(str(path))}?immutable=1", flags)
+        try:
+            self.connections = self._connections()
+            bounds: Any = self._database.execute("SELECT MIN(timestamp), MAX(timestamp) FROM messages").fetchall()
+            self.start_ns: int | None = bounds[0][0]
+            self.end_ns: int | None = bounds[0][1]
+        except BaseException:
+            self.close()
+            raise
+
+    def _connections(self) -> list[Connection]:
+        definitions = {
+            name: MessageDefinition(_FORMATS.get(encoding, MessageDefinitionFormat.NONE), text)
+            for name, encoding, text in self._rows("message_definitions", *_DEFINITION)
+        }
+        counts = dict[int, int](self._database.execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"))
+        return [
+            Connection(
+                number, topic, msgtype, definitions.get(msgtype, MessageDefinition(MessageDefinitionFormat.NONE, "")),
+                digest, counts.get(number, 0), ConnectionExtRosbag2(serialization, qos_of(qos)), None,
+            )
+            for number, topic, msgtype, serialization, qos, digest in self._rows("topics", *_TOPIC)
+        ]
+
+    def _rows(self, table: str, *columns: str) -> Any:
+        """The columns of a table in the order of its ids, "" for one that it lacks."""
+        known = {row[1] for row in self._database.execute(f"PRAGMA table_info({table})")}
+        if not known and table == "message_definitions":
+            return ()
+        chosen = ", ".join(column if column in known else "''" for column in columns)
+        return self._database.execute(f"SELECT {chosen} FROM {table} ORDER BY id")
 
     def close(self) -> None:
-        self._reader.close()
+        self._database.close()
 
     def in_time(self, topics: Collection[str], start_ns: int | None, note: Note) -> Iterator[Stored]:
         return self._select(topics, start_ns, "timestamp, id", note)
@@ -183,9 +215,8 @@ class Sqlite3File:
             f"SELECT topic_id, timestamp, {data} FROM messages WHERE topic_id IN ({', '.join('?' * len(names))}) "
             f"AND timestamp >= ? ORDER BY {order}"
         )
-        assert self._reader.dbconn is not None
         try:
-            rows: Any = self._reader.dbconn.execute(query, (*names, start_ns if start_ns is not None else -1))
+            rows: Any = self._database.execute(query, (*names, start_ns if start_ns is not None else -1))
             for number, time_ns, content in rows:
                 yield from plain(self.path, names[number], time_ns, content, note)
         except apsw.Error as error:
@@ -205,7 +236,15 @@ def open_file(path: Path, scratch: Path, note: Note) -> BagFile:
 
 
 def unpacked(path: Path, scratch: Path, note: Note) -> Path:
-    """The file itself, or what a file compressed by zstd holds, as a file in `scratch`."""
+    """The file itself, or what a file compressed by zstd holds, as a file in `scratch`; of an sqlite3 file whose newest
+    messages its killed writer left beside it (WAL), a copy that holds them."""
+    log = path.with_name(f"{path.name}-wal")
+    if is_sqlite3(path) and log.is_file() and log.stat().st_size:
+        copy = Path(shutil.copy(path, scratch))
+        shutil.copy(log, scratch)
+        with closing(apsw.Connection(str(copy))) as database:
+            database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        return copy
     if not _begins_with(path, _ZSTD):
         return path
     target = scratch / path.stem
@@ -255,12 +294,11 @@ def scan_mcap(path: Path, note: Note) -> Iterator[McapRecord]:
 
 def mcap_connection(channel: Channel, schema: Schema | None) -> Connection:
     """A channel as rosbags describes a topic; digest: of its metadata, else of its definition."""
-    formats = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
     encoding = schema.encoding if schema is not None else ""
-    text = schema.data.decode(errors="replace") if schema is not None and encoding in formats else ""
+    text = schema.data.decode(errors="replace") if schema is not None and encoding in _FORMATS else ""
     return Connection(
         id=channel.id, topic=channel.topic, msgtype=schema.name if schema is not None else "",
-        msgdef=MessageDefinition(formats.get(encoding, MessageDefinitionFormat.NONE), text),
+        msgdef=MessageDefinition(_FORMATS.get(encoding, MessageDefinitionFormat.NONE), text),
         digest=channel.metadata.get("topic_type_hash", ""), msgcount=0,
         ext=ConnectionExtRosbag2(channel.message_encoding, qos_of(channel.metadata.get("offered_qos_profiles"))),
         owner=None,

@@ -29,7 +29,7 @@ from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Episode, FloatArray
 from wm_nodes.recording import messages as m
 from wm_nodes.recording import topics
-from wm_nodes.recording.raw import RawBagWriter
+from wm_nodes.recording.raw import EPISODE_RECORD, EPISODE_TABLE, RawBagWriter
 
 TABLE_COLUMNS = (
     "episode_id", "first_stamp_ns", "length", "seed", "task", "instruction", "behaviour", "source", "policy_version",
@@ -93,6 +93,8 @@ class EpisodeBagWriter:
         if self._bag.bytes_in_file >= self._split_bytes:
             self._bag.split()
         stamps = [self._now_ns + n * self._period_ns for n in range(episode.num_steps + 1)]
+        row = self._row(episode, stamps[0], extra)
+        self._bag.add_record(EPISODE_RECORD, {"row": json.dumps(dict(zip(TABLE_COLUMNS, row)))})
         self._write_reset(episode, stamps[0])
         for step in range(episode.num_steps):
             self._write_step(episode, step, stamps[step], stamps[step + 1])
@@ -100,12 +102,12 @@ class EpisodeBagWriter:
         self._bag.flush()
         self._now_ns = stamps[-1] + self._period_ns
         self._seen.add(episode.episode_id)
-        self._rows.append(self._row(episode, stamps[0], extra))
+        self._rows.append(row)
         self.num_episodes += 1
 
     def close(self) -> Path:
         """Complete the bag and give it its final name, which is returned."""
-        self._bag.custom["wm.episode_table_json"] = json.dumps({"columns": TABLE_COLUMNS, "rows": self._rows})
+        self._bag.custom[EPISODE_TABLE] = json.dumps({"columns": TABLE_COLUMNS, "rows": self._rows})
         versions = sorted({row[TABLE_COLUMNS.index("policy_version")] for row in self._rows})
         self._bag.custom["wm.policy_versions"] = json.dumps(versions)
         return self._bag.close()

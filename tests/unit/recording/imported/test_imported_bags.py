@@ -35,7 +35,7 @@ from wm_nodes.config.load import load_config
 from wm_nodes.core.specs import SOURCE_REAL
 from wm_nodes.core.types import TRY, Episode
 from wm_nodes.policy_rl.pretraining import model_from_data, read_recordings
-from wm_nodes.recording import Bag, RawBagWriter, read_episodes, read_spec
+from wm_nodes.recording import Bag, BagError, RawBagWriter, read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.recording.imported import load_contract, survey
 from wm_nodes.recording.imported import write as write_import
@@ -331,6 +331,30 @@ def test_what_a_detector_says_while_the_robot_is_reset_is_not_said_of_the_episod
             assert (episode.rewards > 0.5).tolist() == expected[1:]
 
 
+@pytest.mark.parametrize(("said", "expected"), [
+    ({0: False, 3: True, 8: False}, [False, False, False, True, True]),  # cleared away while the table is reset
+    ({0: False, 8: True}, [False] * 4 + [True]),  # judged by a person, afterwards
+    ({0: False, 8: False}, [False] * 5),
+])
+def test_what_is_said_of_success_seldom_counts_until_the_next_episode_but_takes_back_none(
+    tmp_path: Path, said: dict[int, bool], expected: list[bool]
+) -> None:
+    says = [(BEGIN_NS + (100 * step + 10) * MS - 20 * MS * (step == 0), "/success", flag(value))
+            for step, value in said.items()]
+    begin = [(BEGIN_NS - 10 * MS, "/episode", flag(True)), (BEGIN_NS + 510 * MS, "/episode", flag(False))]
+    moved = [(time_ns - 10 * MS, topic, one) for time_ns, topic, one in says]
+    (episode,) = one_topic(tmp_path, stream(8) + begin + moved, episodes__split={"topic": "/episode"},
+                           episodes__success={"topic": "/success"})
+    assert episode.success.tolist() == expected
+
+
+def test_labels_may_begin_with_the_mark_that_spreadsheets_write(tmp_path: Path) -> None:
+    bag = Run(2).write(tmp_path / "bag")
+    (tmp_path / "labels.csv").write_text("\ufeffbag,start_s,end_s,success\nbag,0,4,0\nbag,5,9,1\n", encoding="utf-8")
+    contract = contract_file(tmp_path / "contract.yaml", episodes__success={"file": "labels.csv"})
+    assert [bool(one.success[-1]) for one in imported([bag], contract, tmp_path / "out")] == [False, True]
+
+
 def test_where_stamps_lie_in_another_era_the_time_of_reception_or_of_all_stamps_may_count(tmp_path: Path) -> None:
     shifted = [(time_ns + 40 * 10**9, topic, one) for time_ns, topic, one in stream(6)]
     for timeline in ("header", "receive"):
@@ -388,6 +412,12 @@ def test_a_compressed_picture_is_read_in_the_order_that_its_format_says(form: st
     one = compressed(0, rgb[..., ::-1] if form.endswith("compressed rgb8") else rgb, "png")
     one.format = form
     np.testing.assert_array_equal(rgb_of(one), rgb)
+
+
+def test_a_picture_of_16_bits_is_refused_whatever_its_format_says() -> None:
+    depth = compressed(BEGIN_NS, np.full((4, 6), 700, np.uint16), "png")
+    with pytest.raises(BagError, match="bgr8' picture holds uint16 values, as depth does, which is not read"):
+        rgb_of(depth)
 
 
 @pytest.mark.parametrize(("crop", "left", "right"), [("centre", 32, 95), ("none", 0, 127), ((0, 64, 96, 64), 64, 127)])

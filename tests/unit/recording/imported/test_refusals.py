@@ -22,7 +22,10 @@ from foreign_robot import (
     joint_state,
     message,
     seen,
+    write,
 )
+from mcap.writer import Writer
+from rosbags.rosbag2 import StoragePlugin
 
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import ConfigError
@@ -46,6 +49,7 @@ CONTRACTS: list[tuple[dict[str, Any], str]] = [
     ({"actions__0__low": [0.2, 0.2]}, "must be below high"),
     ({"actions__0__high": [0.2]}, "selects 2 values, but has {'high': 1}"),
     ({"actions__0__relative_to": "state"}, "relative to the state, which has no twist.linear.x"),
+    ({"task": "reach"}, "task 'reach' is a known one, whose success is told from values of its own"),
     ({"episodes__split": {"per": "bag", "gap_s": 1.0}}, "give one of topic: /NAME, per: bag, gap_s: SECONDS"),
     ({"episodes__success": {"topic": "/s", "file": "l.csv"}}, "give one of topic: /NAME and file: LABELS.csv"),
     ({"episodes__success": {"topic": "/s", "above": 1.0}}, "give it with std_msgs/msg/Float64"),
@@ -237,6 +241,47 @@ def test_a_bag_and_its_own_file_are_refused(tmp_path: Path) -> None:
 def test_a_bag_of_ros_1_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:
     with pytest.raises(BagError, match=r"run `rosbags-convert --src \S+run\.bag --dst \S+run`"):
         survey([tmp_path / "run.bag"], load_contract(EXAMPLE))
+
+
+def test_an_mcap_of_ros_1_messages_is_refused_with_the_command_that_converts_the_original(tmp_path: Path) -> None:
+    with (tmp_path / "run.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros1")
+        schema = writer.register_schema("sensor_msgs/JointState", "ros1msg", b"")
+        writer.add_message(writer.register_channel(JOINTS, "ros1", schema), BEGIN_NS, b"", BEGIN_NS)
+        writer.finish()
+    with pytest.raises(BagError, match=r"state\.0: /joint_states holds ros1 messages.*run `rosbags-convert --src BAG"):
+        survey([tmp_path / "run.mcap"], load_contract(EXAMPLE))
+
+
+@pytest.mark.parametrize("timeline", ["header", "receive"])
+@pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_a_bag_during_which_a_clock_was_set_back_is_refused(
+    tmp_path: Path, plugin: StoragePlugin, timeline: str
+) -> None:
+    messages = sorted(Run(2).messages(), key=lambda each: each[0])
+    half_ns = messages[len(messages) // 2][0]
+    late = {id(one) for time_ns, _, one in messages if time_ns > half_ns}
+    for one in (one for _, _, one in messages if id(one) in late and hasattr(one, "header")):
+        one.header.stamp.sec -= 3
+    fallen = [(time_ns - 3000 * MS * (id(one) in late), topic, one) for time_ns, topic, one in messages]
+    write(tmp_path / "bag", fallen, plugin, as_listed=True)
+    contract = load_contract(contract_file(tmp_path / "contract.yaml", timeline=timeline))
+    with pytest.raises(BagError, match=r"images\.front: a clock was set back by 1\.1 s while \S+ was recorded"):
+        survey([tmp_path / "bag"], contract)
+
+
+@pytest.mark.parametrize(("head", "words"), [
+    ("bag;start_s;end_s;success\nbag;;;1\n", r"its first line is 'bag;start_s;end_s;success'; it is a CSV"),
+    ("", r"its first line is ''; it is a CSV with the columns bag"),
+])
+def test_a_file_of_labels_without_the_columns_is_refused_with_what_it_has(
+    tmp_path: Path, head: str, words: str
+) -> None:
+    (tmp_path / "labels.csv").write_text(head)
+    contract = contract_file(tmp_path / "contract.yaml", episodes__success={"file": "labels.csv"})
+    with pytest.raises(BagError, match=words):
+        survey([Run(1).write(tmp_path / "bag")], load_contract(contract))
 
 
 def test_a_folder_that_exists_is_refused_before_a_bag_is_read(

@@ -9,6 +9,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from wm_nodes.config.load import read_yaml, refusal
 from wm_nodes.config.sections import NonNegativeInt, PositiveFloat, PositiveInt, SettingsSection
+from wm_nodes.config.tasks import get_task, task_names
 from wm_nodes.core.specs import TARGET, TASK_PREFIX
 
 BOOL, STRING = "std_msgs/msg/Bool", "std_msgs/msg/String"
@@ -120,8 +121,9 @@ class Success(SettingsSection):
     """Which episodes succeeded: a topic, or a file of labels."""
 
     topic: str = ""
-    """Its newest message at or before t says it of frame t. Of the last frame the newest before the next episode says
-    it, or, where three or more came within the episode, the newest until half a step after its end."""
+    """Its newest message at or before t says it of frame t. The last frame is a success also where the newest before
+    the next episode says so, or, where three or more came within the episode, the newest until half a step after its
+    end."""
     type: Literal["std_msgs/msg/Bool", "std_msgs/msg/Float32", "std_msgs/msg/Float64"] = "std_msgs/msg/Bool"
     """Bool says success; a number is the reward, which is recorded too."""
     above: float | None = None
@@ -236,6 +238,9 @@ class Contract(SettingsSection):
         ):
             if twice := {name for name in names if names.count(name) > 1}:
                 raise ValueError(f"several {kind} values are called {', '.join(sorted(twice))}; give them `names`")
+        if self.probes and self.task in task_names() and self.probed_names != [*get_task(self.task).ground_truth_names]:
+            raise ValueError(f"task {self.task!r} is a known one, whose success is told from values of its own, not "
+                             "from these probes; give it another name")
         if wrong := [name for name in self.state_names if TARGET in name or name.startswith(TASK_PREFIX)]:
             raise ValueError(f"measured values are called {', '.join(wrong)}, but {TARGET!r} means commanded and "
                              f"{TASK_PREFIX!r} a task in our bags; give them other `names`")

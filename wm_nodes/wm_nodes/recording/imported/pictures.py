@@ -39,9 +39,13 @@ def rgb_of(message: Any) -> UInt8Array:
     """Image or CompressedImage to uint8 (H, W, 3). Raises BagError as check_encoding, DamagedPictureError."""
     check_encoding(message)
     if message.__msgtype__ != IMAGE:
-        decoded = cv2.imdecode(np.asarray(message.data, np.uint8), cv2.IMREAD_COLOR) if len(message.data) else None
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+        decoded = cv2.imdecode(np.asarray(message.data, np.uint8), flags) if len(message.data) else None
         if decoded is None:
             raise DamagedPictureError(f"a {message.format!r} picture of {len(message.data)} bytes cannot be decoded")
+        if decoded.dtype != np.uint8:
+            raise BagError(f"a {message.format!r} picture holds {decoded.dtype} values, as depth does, which is not "
+                           "read; record the colour pictures of this camera with 8 bits a channel")
         is_rgb = message.format.endswith(RGB_ORDER)
         return np.asarray(decoded if is_rgb else cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), np.uint8)
     channels, conversion = ENCODINGS[message.encoding]

@@ -275,7 +275,10 @@ class Planner:
         values, times = says.values[newest, 0], says.times[newest]
         known = (newest >= 0) & (times >= span.start_ns)
         self.tally.unlabelled += not known[-1]
-        success = known & (values > (self.contract.episodes.success.above or 0))
+        limit, at_end = self.contract.episodes.success.above or 0, int(says.newest(ticks[-1:])[0])
+        success = known & (values > limit)
+        if at_end >= 0 and says.times[at_end] >= span.start_ns:
+            success[-1] |= says.values[at_end, 0] > limit
         if says.source.type != BOOL:
             rewards = np.where(known & (times > ticks - self.contract.period_ns), values, np.nan).astype(np.float32)
         return success, rewards
@@ -320,12 +323,15 @@ def _labels_of(file: str, bag: str) -> Sequence[tuple[float, float, bool]]:
         BagError: no such file, column or number, or rows that overlap.
     """
     try:
-        with Path(file).open(newline="", encoding="utf-8") as stream:
+        with Path(file).open(newline="", encoding="utf-8-sig") as stream:  # a spreadsheet may write a byte order mark
+            table = csv.DictReader(stream)
+            if not {*LABEL_COLUMNS} <= {*(table.fieldnames or ())}:
+                raise ValueError(f"its first line is {','.join(table.fieldnames or ())!r}")
             rows = sorted(
                 (float(row["start_s"] or 0), float(row["end_s"] or np.inf), bool(int(row["success"])))
-                for row in csv.DictReader(stream) if row["bag"] == bag
+                for row in table if row["bag"] == bag
             )
-    except (OSError, KeyError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError) as error:
         raise BagError(f"labels {file} cannot be read: {error}; it is a CSV with the columns "
                        f"{', '.join(LABEL_COLUMNS)}, success 0 or 1") from None
     for (start_s, end_s, _), (next_s, last_s, _) in pairwise(rows):

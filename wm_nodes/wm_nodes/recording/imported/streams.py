@@ -162,10 +162,16 @@ def check_topics(bag: Bag, contract: Contract) -> None:
             same = [topic for topic, msgtype in types.items() if msgtype == source.type and bag.count(topic)]
             close = get_close_matches(source.topic, same, n=3, cutoff=0) or ["none"]
             wrong.append(f"{place}: no message on {source.topic}; topics of {source.type}: {', '.join(close)}")
+        elif (serialization := bag.serialization(source.topic)) != "cdr":
+            wrong.append(f"{place}: {source.topic} holds {serialization} messages, and ROS 2 writes cdr; of a bag of "
+                         "ROS 1, run `rosbags-convert --src BAG.bag --dst FOLDER` on the original, and import FOLDER")
         elif recorded != source.type:
             wrong.append(f"{place}: {source.topic} is of {recorded}, not {source.type}; correct its type")
         elif not is_known(source.type):
             wrong.append(f"{place}: {source.type} is not one of ROS 2 Jazzy's common types; republish it as one")
+        elif (fall_ns := bag.set_back_ns(source.topic)) > SET_BACK_NS:
+            wrong.append(f"{place}: a clock was set back by {fall_ns / NS_PER_S:.1f} s while {source.topic} was "
+                         "recorded, so that two times would mix; leave this bag out, or cut it there")
     if wrong:
         raise BagError(f"bag {bag.path} does not fit the contract: {'; '.join(wrong)}")
     bag.check_types([source.topic for source in contract.sources().values()])
