@@ -153,7 +153,7 @@ def test_acceptance_judges_the_done_signal_and_says_that_it_cannot_judge_positio
     heldout = stack_episodes(read_episodes(bag), models.tasks, num_steps=spec.max_episode_steps)
     report = accept_world_model(models, heldout, config)
     names = [row.name.split(", step")[0] for row in report.criteria]
-    assert names == ["done precision on rollouts", "done recall on rollouts", "feature distance / copying",
+    assert names == ["done precision in time on rollouts", "done recall on rollouts", "feature distance / copying",
                      "feature distance, other / recorded actions", "varying pixels, unexplained"]
     assert report.task == spec.task and "Positions were not judged" in report.notes[0]
 

@@ -43,7 +43,7 @@ def test_a_model_is_trained_judged_and_kept_and_the_folder_alone_goes_on(
     assert f"acceptance {verdict['outcome']}" in text and "--model-dir" in text
     names = [row["name"].split(", step")[0] for row in verdict["criteria"]]
     assert names == [
-        "done precision on rollouts", "done recall on rollouts", "feature distance / copying",
+        "done precision in time on rollouts", "done recall on rollouts", "feature distance / copying",
         "feature distance, other / recorded actions",
     ]
     assert {"feature_ratio_h01", "feature_floor_h01", "other_actions_h01", "done_touch_the_post_auc"} <= {

@@ -228,7 +228,7 @@ def test_what_a_models_manifest_says_stands_in_for_a_measurement() -> None:
 
 
 BY_PICTURES = {
-    "done_stir_precision": 0.9, "done_stir_precision_low": 0.7, "done_stir_precision_high": 0.95,
+    "done_stir_in_time": 0.9, "done_stir_in_time_low": 0.7, "done_stir_in_time_high": 0.95,
     "done_stir_recall": 0.8, "done_stir_recall_low": 0.6, "done_stir_recall_high": 0.9,
     "done_stir_auc": 0.87, "done_stir_real_rate": 0.4,
     "feature_episodes_h08": 20.0, "feature_episodes_h16": 9.0,
@@ -246,7 +246,7 @@ def judged_by_pictures(**changes: float) -> AcceptanceReport:
 def test_a_model_without_positions_passes_by_its_done_signal_its_pictures_and_its_actions() -> None:
     report = judged_by_pictures()
     assert report.passed and [(row.name, row.value) for row in report.criteria] == [
-        ("done precision on rollouts", 0.9), ("done recall on rollouts", 0.8),
+        ("done precision in time on rollouts", 0.9), ("done recall on rollouts", 0.8),
         ("feature distance / copying, step 8", 0.5), ("feature distance, other / recorded actions, step 8", 1.3),
         ("varying pixels, unexplained, step 0", 0.2),
     ]
@@ -268,8 +268,10 @@ def test_a_model_without_positions_passes_by_its_done_signal_its_pictures_and_it
         ({"other_actions_low_h08": 0.9}, "undecided", "other / recorded actions, step 8"),
         ({"done_stir_recall": 0.3, "done_stir_recall_high": 0.5}, "failed", "done recall on rollouts"),
         ({"done_stir_recall": 0.3, "done_stir_recall_high": 0.7}, "undecided", "done recall on rollouts"),
-        ({"done_stir_precision": 0.9, "done_stir_precision_low": 0.5}, "undecided", "done precision on rollouts"),
-        ({"done_stir_precision": np.nan}, "undecided", "done precision on rollouts"),
+        ({"done_stir_in_time": 0.9, "done_stir_in_time_low": 0.5}, "undecided", "done precision in time on rollouts"),
+        ({"done_stir_in_time": 0.1, "done_stir_in_time_low": 0.02, "done_stir_in_time_high": 0.3}, "failed",
+         "done precision in time on rollouts"),  # paid at once, whatever happens later
+        ({"done_stir_in_time": np.nan}, "undecided", "done precision in time on rollouts"),
     ],
 )
 def test_without_positions_each_criterion_alone_keeps_a_model_back(
@@ -285,10 +287,11 @@ def test_what_recordings_cannot_show_is_named_and_not_judged() -> None:
         done_stir_real_rate=1.0, done_stir_auc=np.nan, other_actions_low_h08=np.nan, other_actions_h08=np.nan,
         varying_error_h00=np.nan, varying_error_h01=np.nan,
     )
-    assert [row.name for row in report.criteria] == ["done recall on rollouts", "feature distance / copying, step 8"]
+    assert [row.name for row in report.criteria] == [
+        "done precision in time on rollouts", "done recall on rollouts", "feature distance / copying, step 8"
+    ]
     notes = " ".join(report.notes)
-    for words in ("Precision of the done signal was not judged: every held-out episode succeeds",
-                  "AUC of the done signal was not judged", "Sensitivity to actions was not judged",
+    for words in ("AUC of the done signal was not judged", "Sensitivity to actions was not judged",
                   "What the tokenizer loses was not judged"):
         assert words in notes
 

@@ -125,14 +125,13 @@ def apply_criteria(
     else:
         criteria, notes = [], ["Positions were not judged: no ground truth names them."]
         near_misses, successes = RECORDED_NEAR_MISSES, RECORDED_SUCCESSES
+    precision = "precision" if has_positions else "in_time"  # elsewhere the clone's replays show when it is paid
     for kind, threshold, remedy in (
-        ("precision", limits.done_precision, near_misses), ("recall", limits.done_recall, successes),
+        (precision, limits.done_precision, near_misses), ("recall", limits.done_recall, successes),
     ):
-        if kind == "precision" and not has_positions and metrics.get(f"done_{task}_real_rate") == 1:
-            notes.append("Precision of the done signal was not judged: every held-out episode succeeds.")
-            continue
         value, interval = _mean_of_parts(metrics, parts_of(task), kind)
-        name = f"done {kind} on rollouts" + (", mean of the tasks" if len(parts_of(task)) > 1 else "")
+        said = "precision in time" if kind == "in_time" else kind
+        name = f"done {said} on rollouts" + (", mean of the tasks" if len(parts_of(task)) > 1 else "")
         outcome: Outcome = "passed" if value >= threshold else "failed"
         rule = ">="
         if not has_positions:  # a stranger's recordings may be few

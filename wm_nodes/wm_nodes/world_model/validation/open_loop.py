@@ -32,6 +32,8 @@ from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.tokenizer import episode_targets
 
 HORIZONS = (1, 2, 4, 8, 12, 16, 32, 64)
+EARLY_STEPS, EARLY_SHARE = 3, 0.25
+"""By how many steps, or which share of the episode if that is more, a done signal in time may precede the success."""
 MOVED_M = 0.01
 """An object counts as moved when it ends this far from where it began."""
 BATCH = 64
@@ -166,8 +168,8 @@ def evaluate_rollouts(
         rows = labelled[:, j]
         if not rows.any():
             continue
-        signal, happened = _done(imagined, episodes, [j] * len(episodes))
-        detection = detection_metrics(signal[rows], happened[rows], threshold)
+        signal, happened, in_time = _done(imagined, episodes, [j] * len(episodes), threshold)
+        detection = detection_metrics(signal[rows], happened[rows], in_time[rows], threshold)
         metrics |= {f"done_{task}_{key}": value for key, value in detection.items()}
         metrics[f"done_{task}_uncertainty_p99"] = float(
             np.quantile(imagined.uncertainty[rows, :, j][frame_mask[rows]], 0.99)
@@ -181,13 +183,13 @@ def episode_errors(
     threshold: float, probe: PositionProbe | None = None,
 ) -> dict[str, FloatArray]:
     """Of the rollout of each episode, (E,): error of the object and of the tool after its last step (object_cm,
-    tool_cm; not without ground truth), and whether the done signal exceeds `threshold` if and only if the episode
-    succeeds (done_right, bool), in `task` or, where that has parts, in the task it was recorded for.
+    tool_cm; not without ground truth), and whether the done signal exceeds `threshold` in time, or never in an
+    episode that fails (done_right, bool), in `task` or, where that has parts, in the task it was recorded for.
     """
     imagined, rows = imagine_episodes(tokenizer, model, episodes), np.arange(len(episodes))
     own = [episodes.tasks.index(task if task in episodes.tasks else name) for name in episodes.recorded_tasks]
-    signal, happened = _done(imagined, episodes, own)
-    right = {"done_right": (signal > threshold) == happened}
+    signal, happened, in_time = _done(imagined, episodes, own, threshold)
+    right = {"done_right": np.where(signal > threshold, in_time, ~happened)}
     if not episodes.ground_truth.shape[-1]:
         return right
     last = imagined.frames[rows, episodes.lengths - 1][:, None]
@@ -201,22 +203,30 @@ def episode_errors(
 
 
 def _done(
-    imagined: ImaginedEpisodes, episodes: EpisodeArrays, tasks: Sequence[int]
-) -> tuple[FloatArray, BoolArray]:
-    """(E,), the highest done signal of each episode's task within the recorded steps, and whether it succeeds."""
+    imagined: ImaginedEpisodes, episodes: EpisodeArrays, tasks: Sequence[int], threshold: float
+) -> tuple[FloatArray, BoolArray, BoolArray]:
+    """(E,), the highest done signal of each episode's task within the recorded steps, whether it succeeds, and whether
+    it does before the signal exceeds the threshold or soon after it, see EARLY_STEPS."""
     rows, mask = np.arange(len(episodes)), episodes.step_mask
-    signal: FloatArray = np.where(mask, imagined.signals[rows, :, tasks], 0).max(1)
-    return signal, (episodes.success[rows, 1:, tasks] & mask).any(1)
+    signals: FloatArray = np.where(mask, imagined.signals[rows, :, tasks], 0)
+    succeeded = episodes.success[rows, 1:, tasks] & mask
+    latest = (signals > threshold).argmax(1) + np.maximum(EARLY_STEPS, EARLY_SHARE * episodes.lengths)
+    soon = np.arange(mask.shape[1]) <= latest[:, None]
+    return signals.max(1), succeeded.any(1), (succeeded & soon).any(1)
 
 
-def detection_metrics(scores: FloatArray, positive: BoolArray, threshold: float) -> dict[str, float]:
+def detection_metrics(
+    scores: FloatArray, positive: BoolArray, in_time: BoolArray, threshold: float
+) -> dict[str, float]:
     """Precision and recall with their Wilson intervals, and agreement, of scores > threshold, AUC, and both rates; NaN
-    where undefined."""
+    where undefined. in_time: whether a positive comes so soon after its score that it counts in `in_time`, the
+    precision in time, and in agreement."""
     fired = scores > threshold
-    shares = {"precision": wilson_of_share(positive[fired]), "recall": wilson_of_share(fired[positive])}
+    shares = {"precision": wilson_of_share(positive[fired]), "in_time": wilson_of_share(in_time[fired]),
+              "recall": wilson_of_share(fired[positive])}
     return {
         **{f"{name}{end}": value for name, share in shares.items() for end, value in zip(("", "_low", "_high"), share)},
-        "agreement": float((fired == positive).mean()),
+        "agreement": float(np.where(fired, in_time, ~positive).mean()),
         "auc": auc(scores, positive),
         "imagined_rate": float(fired.mean()),
         "real_rate": float(positive.mean()),
