@@ -91,7 +91,8 @@ def test_steps_after_the_first_success_are_left_out() -> None:
 def test_only_successful_expert_episodes_are_demonstrations() -> None:
     failed = replace(DEMOS[0], success=np.zeros_like(DEMOS[0].success))
     noisy = replace(DEMOS[1], behaviour="noisy")
-    found = demonstrations([failed, noisy, *DEMOS[2:6]], 3)
+    done = replace(DEMOS[0], success=np.ones_like(DEMOS[0].success))  # the rest of a try that a gap has cut
+    found = demonstrations([failed, noisy, done, *DEMOS[2:6]], 3)
     assert [episode.seed for episode in found] == [102, 103, 104]
     with pytest.raises(ValueError, match=r"sft\.num_demonstrations is 3, but the data hold 1"):
         demonstrations([failed, noisy, DEMOS[2]], 3)

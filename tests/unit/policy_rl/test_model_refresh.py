@@ -120,6 +120,22 @@ def test_the_next_round_also_imagines_from_frames_of_the_policys_own_episodes(
         load_start_seeds(tmp_path / "round.safetensors")
 
 
+def test_starts_are_of_the_newest_policys_episodes_first(
+    config: RunConfig, bags: tuple[list[Path], list[Path]], tmp_path: Path
+) -> None:
+    for number, part in enumerate((bags[1], bags[0]), 1):
+        folder = model_refresh.round_folder(tmp_path, number) / "bags" / "train"
+        folder.mkdir(parents=True)
+        for bag in part:
+            (folder / bag.name).symlink_to(bag)
+    few = config.with_values(model_refresh=config.model_refresh.with_values(own_starts=3))
+    write_starts(bags[1], tmp_path / "first")
+    write_round_starts(few, tmp_path / "first", model_refresh.own_episodes(tmp_path, 2), tmp_path / "round")
+    newest = {frame.tobytes() for bag in bags[0] for episode in read_episodes(bag) for frame in episode.images}
+    images, _ = load_starts(tmp_path / "round", config.task)
+    assert [image.tobytes() in newest for image in images] == [False] * 2 + [True] * 3
+
+
 def test_quantised_models_are_refused_with_the_remedy(config: RunConfig, tmp_path: Path) -> None:
     quantised = config.model_copy(update={"tokenizer": config.tokenizer.model_copy(update={"kind": "lfq"})})
     folder = make_model_folder(tmp_path / "model", quantised)

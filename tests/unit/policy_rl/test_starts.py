@@ -75,6 +75,17 @@ def test_any_frame_is_one_before_success_which_the_seed_decides(bag: Path, tmp_p
     assert len(set(numbers[:, ::3].flat)) > 2 and numbers[:, 1::3].max() > 4
 
 
+def test_an_episode_that_begins_done_is_no_start(tmp_path: Path) -> None:
+    spec = make_spec()
+    for name, begins in (("some", (5, 0, None)), ("none", (0, 0))):
+        with EpisodeBagWriter(tmp_path / name, spec, run_id="test") as writer:
+            for index, first in enumerate(begins):
+                writer.write(recorded(index, first, spec))
+    assert write_starts([tmp_path / "some"], tmp_path / STARTS) == 2
+    with pytest.raises(ValueError, match="no episode to start from whose first frame is not a success already"):
+        write_starts([tmp_path / "none"], tmp_path / STARTS)
+
+
 def test_a_start_for_several_tasks_is_before_success_in_all_of_them() -> None:
     spec = make_spec()
     truth = np.zeros((10, len(GROUND_TRUTH_NAMES)), np.float32)
@@ -110,7 +121,7 @@ def test_goals_are_those_of_each_starts_instruction_in_both_forms_of_the_environ
     images, states = (array[[0, 0]] for array in load_starts(MODEL / STARTS))
     with EpisodeBagWriter(tmp_path / "bag", spec, run_id="test") as writer:
         for index, text in enumerate((spec.instruction, "move the gripper above the blue cube")):
-            made = make_episode(spec, index, steps=1, instruction=text)
+            made = make_episode(spec, index, steps=1, instruction=text, success=np.zeros(2, bool))
             made.images[0], made.states[0] = images[index], states[index]
             writer.write(made)
     write_starts([tmp_path / "bag"], tmp_path / STARTS)

@@ -62,7 +62,7 @@ def demonstrations(
     successful = (
         episode for episode in episodes
         if episode.behaviour == behaviour and bool(episode.success.any())
-        and not episode.success[: expert_from(episode)].any()
+        and not episode.success[: expert_from(episode) + 1].any()
     )
     demos = list(islice(successful, count))
     if len(demos) < count:

@@ -74,6 +74,8 @@ def write_starts(
         for episode in read_episodes(bag):
             if counts[episode.task] == limit:
                 break
+            if episode.success[0]:
+                continue  # as of an imported try that a gap has cut: nothing is left to do
             counts[episode.task] += 1
             chosen.append(episode)
     write_atomic(path, save(episode_starts(chosen, tasks=tasks, frames=frames, seed=seed)))
@@ -83,7 +85,10 @@ def write_starts(
 def episode_starts(
     chosen: Sequence[Episode], *, tasks: Sequence[str] = (), frames: Literal["first", "any"] = "first", seed: int = 0
 ) -> dict[str, torch.Tensor]:
-    """What write_starts writes of these episodes, by name."""
+    """What write_starts writes of these episodes, by name. Raises ValueError: there is none."""
+    if not chosen:
+        raise ValueError("there is no episode to start from whose first frame is not a success already; record the "
+                         "robot before it has done the task, with success false")
     stream = numpy_stream(seed, "start_frames")
     rows = [int(stream.integers(frames_before_success(e, tasks))) if frames == "any" else 0 for e in chosen]
     return {

@@ -210,6 +210,12 @@ def round_folder(run_dir: Path, number: int) -> Path:
     return run_dir / "rounds" / str(number)
 
 
+def own_episodes(run_dir: Path, number: int) -> list[Path]:
+    """Bags of the policies' episodes of all rounds up to `number`, those of the newest policy first."""
+    parts = (round_folder(run_dir, k) / "bags" / "train" for k in range(number, 0, -1))
+    return [bag for part in parts for bag in sorted(part.glob("shard_*"))]
+
+
 def round_starts(config: RunConfig, run_dir: Path, number: int, first_frames: Path) -> Path:
     """The starts file of round `number`: with frames of the policy's own episodes where the round before wrote some."""
     own = number > 1 and config.model_refresh.own_starts > 0
@@ -298,9 +304,8 @@ def refresh_round(
         f"collecting {settings.episodes_per_round} + {settings.heldout_episodes} (held out) episodes of the policy in "
         "the simulator"
     )
-    bags, heldout = collect_round(config, model_dir, weights, folder / "bags", number)
-    earlier = (round_folder(run_dir, k) / "bags" / "train" for k in range(1, number))
-    own = [*(bag for part in earlier for bag in sorted(part.glob("shard_*"))), *bags]
+    _, heldout = collect_round(config, model_dir, weights, folder / "bags", number)
+    own = own_episodes(run_dir, number)
     if settings.own_starts:
         write_round_starts(config, first_frames, own, folder / STARTS)
     say(f"refreshing the world model: {settings.refresh_iterations} iterations")

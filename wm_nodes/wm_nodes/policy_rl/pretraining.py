@@ -174,7 +174,8 @@ def read_recordings(bags: Sequence[Path], config: RunConfig, task: str = "") -> 
         bags, num_heldout=config.data.num_heldout, seed=config.seed, task=task, ground_truth=config.data.ground_truth,
         check=lambda spec: Tokenizer(config.tokenizer, spec.height, spec.width, 0),
     )
-    return data, episode_starts(episodes[:MAX_STARTS], frames=config.data.start_frames, seed=config.seed)
+    undone = [episode for episode in episodes if not episode.success[0]]
+    return data, episode_starts(undone[:MAX_STARTS], frames=config.data.start_frames, seed=config.seed)
 
 
 def model_from_data(

@@ -186,6 +186,8 @@ def _used(
            f"held out: {held.sum()} ({(won & held).sum()} succeed)")
     if long := [len(of_one) for of_one in parts if len(of_one) > 1]:
         yield f"{_count(len(long), 'long episode')} in {sum(long)} parts, with every step"
+    if done := sum(bool(episode.success[0]) for episode in episodes):
+        yield f"{_count(done, 'episode')} already done in the first frame: no demonstration, and nothing starts there"
     if len(texts := {episode.instruction for episode in episodes}) > 1:
         yield f"{len(texts)} instructions: goals follow them; the done signal and the policy do not read them"
 
