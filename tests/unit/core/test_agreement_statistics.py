@@ -8,10 +8,12 @@ import pytest
 from wm_nodes.core.statistics import (
     auroc,
     balanced_accuracy,
+    bootstrap_ratio,
     effective_size,
     expected_calibration_error,
     kappa,
     wilson_interval,
+    wilson_of_groups,
     wilson_of_share,
 )
 
@@ -68,6 +70,15 @@ def test_auroc_counts_pairs_in_order_and_ties_half() -> None:
     assert math.isnan(auroc([True, True], [0.9, 0.5]))
     with pytest.raises(ValueError, match="NaN"):
         auroc([True, False], [math.nan, 0.5])
+
+
+def test_what_belongs_together_counts_once_in_an_interval() -> None:
+    groups, correct = np.repeat(np.arange(10), 6), np.repeat(np.arange(10) < 8, 6)
+    assert wilson_of_groups(correct, groups) == pytest.approx((0.8, *wilson_interval(8, 10)))
+    assert wilson_of_groups(correct, np.arange(60)) == wilson_of_share(correct)
+    top, bottom = np.linspace(1, 2, 10), np.linspace(3, 5, 10)
+    whole = bootstrap_ratio(top, bottom, np.arange(10), seed=0)
+    assert bootstrap_ratio(top.repeat(6), bottom.repeat(6), groups, seed=0) == pytest.approx(whole)
 
 
 def test_weighted_share_has_wilsons_interval_at_its_effective_size() -> None:

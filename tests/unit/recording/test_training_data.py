@@ -75,6 +75,7 @@ def test_a_long_episode_is_cut_in_parts_that_hold_every_step_and_stay_on_one_sid
         np.testing.assert_array_equal(np.concatenate(data.training.actions[row : row + 3, :43]), one.actions)
         np.testing.assert_array_equal(data.training.images[row + 2, 43], one.images[-1])
     assert "8 long episodes in 24 parts, with every step" in data.summary
+    assert [len(set(side.tries)) for side in (data.training, data.heldout)] == [6, 2]
 
 
 def test_episodes_of_one_try_stay_on_one_side_and_count_as_one(tmp_path: Path) -> None:
@@ -85,6 +86,7 @@ def test_episodes_of_one_try_stay_on_one_side_and_count_as_one(tmp_path: Path) -
     data = read(bag)
     tries = [{(seed - 1000) // 3 for seed in side.seeds} for side in (data.training, data.heldout)]
     assert not tries[0] & tries[1] and tries[0] | tries[1] == set(range(11))
+    assert [len(np.unique(side.independent)) for side in (data.training, data.heldout)] == [*map(len, tries)]
     assert "32 episodes of 11 tries; those of one try are all trained on or all held out" in data.summary
     whole, numbered = (write(tmp_path / name, episodes(20, change=change)) for name, change in (
         ("whole", lambda e: e), ("numbered", of_try(1))

@@ -209,12 +209,15 @@ def test_a_checkpoint_of_another_architecture_is_one_clear_error(tmp_path: Path)
 
 def test_auc_counts_ties_half_and_detection_counts_episodes() -> None:
     scores, positive = np.array([0.9, 0.5, 0.5, 0.1], np.float32), np.array([True, True, False, False])
+    tries = np.arange(4)
     assert auc(scores, positive) == pytest.approx((1 + 1 + 0.5 + 1) / 4)
-    found = detection_metrics(scores, positive, positive, 0.6)
+    found = detection_metrics(scores, positive, positive, 0.6, tries)
     assert (found["precision"], found["recall"], found["agreement"]) == (1.0, 0.5, 0.75)
-    assert np.isnan(detection_metrics(scores, np.zeros(4, bool), np.zeros(4, bool), 0.95)["precision"])
-    early = detection_metrics(scores, positive, np.zeros(4, bool), 0.6)
+    assert np.isnan(detection_metrics(scores, np.zeros(4, bool), np.zeros(4, bool), 0.95, tries)["precision"])
+    early = detection_metrics(scores, positive, np.zeros(4, bool), 0.6, tries)
     assert (early["precision"], early["in_time"], early["agreement"]) == (1.0, 0.0, 0.5)
+    cut = [np.repeat(values, 5) for values in (scores, positive, positive)]
+    assert detection_metrics(*cut, 0.6, np.repeat(tries, 5)) == found, "parts of one try say no more than the whole"
 
 
 def test_decoded_losses_are_smallest_for_the_true_latents_and_reach_the_predictions_only() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.core.types import BoolArray
 
 Z_95 = 1.959963984540054
 """Two-sided 95 % quantile of the standard normal distribution."""
@@ -112,10 +113,13 @@ def bootstrap_mean(
     return float(array.mean()), float(low), float(high)
 
 
-def bootstrap_ratio(top: ArrayLike, bottom: ArrayLike, *, seed: int, draws: int = 2_000) -> tuple[float, float]:
-    """Return the 95 % percentile bootstrap interval of mean(top) / mean(bottom) over pairs; NaN without pairs, or where
-    bottom is 0."""
-    above, below = np.asarray(top, np.float64), np.asarray(bottom, np.float64)
+def bootstrap_ratio(
+    top: ArrayLike, bottom: ArrayLike, groups: NDArray[np.int64], *, seed: int, draws: int = 2_000
+) -> tuple[float, float]:
+    """Return the 95 % percentile bootstrap interval of mean(top) / mean(bottom) over groups of pairs, a number for each
+    pair; NaN without pairs, or where bottom is 0."""
+    _, of_pair = np.unique(groups, return_inverse=True)
+    above, below = (np.bincount(of_pair, np.asarray(values, np.float64)) for values in (top, bottom))
     if not len(above):
         return NAN, NAN
     rows = numpy_stream(seed, "bootstrap_ratio", len(above)).integers(len(above), size=(draws, len(above)))
@@ -238,6 +242,16 @@ def effective_size(weights: ArrayLike) -> float:
     values = np.asarray(weights, np.float64)
     squares = float((values**2).sum())
     return float(values.sum()) ** 2 / squares if squares else 0.0
+
+
+def wilson_of_groups(correct: BoolArray, groups: NDArray[np.int64]) -> tuple[float, float, float]:
+    """Return (share, low, high): a share of decisions and its 95 % Wilson interval at the number of groups, as if those
+    of one group were a single one; (NaN, 0, 1) without any."""
+    size = len(np.unique(groups))
+    if size == len(groups):
+        return wilson_of_share(correct)
+    share = float(correct.mean())
+    return (share, *wilson_interval(share * size, size))
 
 
 def wilson_of_share(correct: ArrayLike, weights: ArrayLike | None = None) -> tuple[float, float, float]:

@@ -38,9 +38,16 @@ class EpisodeArrays:
     (Task.parts), that one."""
     seeds: tuple[int, ...] = ()
     """(E,), of their resets; () where unknown."""
+    tries: tuple[int, ...] = ()
+    """(E,), the number of the try that each is a part of; () where each is a whole one."""
 
     def __len__(self) -> int:
         return len(self.images)
+
+    @property
+    def independent(self) -> NDArray[np.int64]:
+        """(E,), equal where two are of one try, which are not independent of each other."""
+        return np.array(self.tries or range(len(self)), np.int64)
 
     @property
     def num_steps(self) -> int:
@@ -70,6 +77,7 @@ class EpisodeArrays:
             self.lengths[index], self.tasks, tuple(self.instructions[i] for i in index),
             tuple(self.behaviours[i] for i in index), tuple(self.recorded_tasks[i] for i in index),
             tuple(self.seeds[i] for i in index) if self.seeds else (),
+            tuple(self.tries[i] for i in index) if self.tries else (),
         )
 
     @classmethod
@@ -101,9 +109,10 @@ def check_finite(episodes: Iterable[Episode]) -> None:
 
 
 def stack_episodes(
-    episodes: Iterable[Episode], tasks: Sequence[str], *, num_steps: int | None = None
+    episodes: Iterable[Episode], tasks: Sequence[str], *, num_steps: int | None = None, tries: Sequence[int] = (),
 ) -> EpisodeArrays:
-    """Stack episodes of one camera set-up; longer ones are cut to num_steps (None: the longest decides).
+    """Stack episodes of one camera set-up; longer ones are cut to num_steps (None: the longest decides). tries: see
+    EpisodeArrays.
 
     Whether a task is done is as in config.tasks.success_or_recorded.
 
@@ -138,5 +147,5 @@ def stack_episodes(
         lengths=lengths, tasks=tuple(tasks), instructions=tuple(e.instruction for e in listed),
         behaviours=tuple(e.behaviour for e in listed), recorded_tasks=tuple(
             own[int(e.states[0, -len(own) :].argmax())] if own else e.task for e, own in zip(listed, parts, strict=True)
-        ), seeds=tuple(e.seed for e in listed),
+        ), seeds=tuple(e.seed for e in listed), tries=tuple(tries),
     )

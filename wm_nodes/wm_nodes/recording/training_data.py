@@ -92,7 +92,9 @@ def read_training_data(
     held = _heldout(won_tries, num_heldout, seed)[tries]  # one draw for each try
     training, heldout = (
         stack_episodes([part for of_one, its in zip(parts, held) if its == is_held for part in of_one], tasks,
-                       num_steps=most if spec.ground_truth_names else longest)
+                       num_steps=most if spec.ground_truth_names else longest,
+                       tries=[number for of_one, its, number in zip(parts, held, tries.tolist()) if its == is_held
+                              for _ in of_one])
         for is_held in (False, True)
     )
     chosen = [episode for episode, its in zip(episodes, held) if not its]

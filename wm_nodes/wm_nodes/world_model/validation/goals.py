@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.core.statistics import bootstrap_ratio, wilson_of_share
+from wm_nodes.core.statistics import bootstrap_ratio, wilson_of_groups
 from wm_nodes.core.types import FloatArray
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.world_model.folder import WorldModels
@@ -44,7 +44,7 @@ def goal_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig
         models.text, models.tokenizer, episodes.images[rows, 0], instructions, [column] * len(rows),
         horizon=episodes.num_steps, threshold=config.reward.goal_threshold,
     )
-    for end, value in zip(("", "_low", "_high"), wilson_of_share(imagined.found)):
+    for end, value in zip(("", "_low", "_high"), wilson_of_groups(imagined.found, episodes.independent[rows])):
         metrics[f"goal_found{end}"] = value
     errors = dict[tuple[str, str], FloatArray]()
     read, truth = position_reader(models.tokenizer, models.probe), episode_targets(episodes)[rows, reached]
@@ -60,6 +60,6 @@ def goal_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig
         errors["perceptual", ending] = distance
         metrics[f"goal_perceptual{ending}"] = float(distance.mean())
     for name in (*places, "perceptual"):
-        low, high = bootstrap_ratio(errors[name, ""], errors[name, "_copy"], seed=0)
+        low, high = bootstrap_ratio(errors[name, ""], errors[name, "_copy"], episodes.independent[rows], seed=0)
         metrics |= {f"goal_{name}_ratio_low": low, f"goal_{name}_ratio_high": high}
     return metrics

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wm_nodes.core.statistics import bootstrap_ratio, wilson_of_share
+from wm_nodes.core.statistics import bootstrap_ratio, wilson_of_groups
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.reward.picture_similarity import psnr_db, ssim
@@ -162,14 +162,16 @@ def evaluate_rollouts(
         for name, columns, chosen in (
             ("object", thing, rows), ("object_moved", thing, rows & moved), ("tool", tool, rows),
         ):
-            metrics |= _position_metrics(estimates, truth[:, horizon], columns, chosen, f"{name}_{{}}_{label}")
+            pattern, tries = f"{name}_{{}}_{label}", episodes.independent[chosen]
+            metrics |= _position_metrics(estimates, truth[:, horizon], columns, chosen, pattern, tries)
     frame_mask, labelled = episodes.step_mask, episodes.labelled
     for j, task in enumerate(episodes.tasks):
         rows = labelled[:, j]
         if not rows.any():
             continue
         signal, happened, in_time = _done(imagined, episodes, [j] * len(episodes), threshold)
-        detection = detection_metrics(signal[rows], happened[rows], in_time[rows], threshold)
+        told = (signal[rows], happened[rows], in_time[rows])
+        detection = detection_metrics(*told, threshold, episodes.independent[rows])
         metrics |= {f"done_{task}_{key}": value for key, value in detection.items()}
         metrics[f"done_{task}_uncertainty_p99"] = float(
             np.quantile(imagined.uncertainty[rows, :, j][frame_mask[rows]], 0.99)
@@ -216,14 +218,17 @@ def _done(
 
 
 def detection_metrics(
-    scores: FloatArray, positive: BoolArray, in_time: BoolArray, threshold: float
+    scores: FloatArray, positive: BoolArray, in_time: BoolArray, threshold: float, tries: NDArray[np.int64]
 ) -> dict[str, float]:
-    """Precision and recall with their Wilson intervals, and agreement, of scores > threshold, AUC, and both rates; NaN
-    where undefined. in_time: whether a positive comes so soon after its score that it counts in `in_time`, the
-    precision in time, and in agreement."""
+    """Precision and recall with their Wilson intervals over tries, and agreement, of scores > threshold, AUC, and both
+    rates; NaN where undefined. in_time: whether a positive comes so soon after its score that it counts in `in_time`,
+    the precision in time, and in agreement. tries: equal where two are not independent of each other."""
     fired = scores > threshold
-    shares = {"precision": wilson_of_share(positive[fired]), "in_time": wilson_of_share(in_time[fired]),
-              "recall": wilson_of_share(fired[positive])}
+    shares = {
+        "precision": wilson_of_groups(positive[fired], tries[fired]),
+        "in_time": wilson_of_groups(in_time[fired], tries[fired]),
+        "recall": wilson_of_groups(fired[positive], tries[positive]),
+    }
     return {
         **{f"{name}{end}": value for name, share in shares.items() for end, value in zip(("", "_low", "_high"), share)},
         "agreement": float(np.where(fired, in_time, ~positive).mean()),
@@ -242,7 +247,8 @@ def auc(scores: NDArray[np.floating[Any]], positive: BoolArray) -> float:
 
 
 def _position_metrics(
-    estimates: dict[str, FloatArray], truth_EP: FloatArray, columns: list[int], rows: BoolArray, pattern: str
+    estimates: dict[str, FloatArray], truth_EP: FloatArray, columns: list[int], rows: BoolArray, pattern: str,
+    tries: NDArray[np.int64],
 ) -> dict[str, float]:
     name, label = pattern.split("_{}_")
     errors = {
@@ -251,7 +257,7 @@ def _position_metrics(
     }
     metrics = {f"{name}_{key}_cm_{label}": _mean(value) for key, value in errors.items()}
     metrics[f"{name}_rollout_median_cm_{label}"] = float(np.median(errors["rollout"])) if rows.any() else float("nan")
-    interval = bootstrap_ratio(errors["rollout"], errors["copy"], seed=0)
+    interval = bootstrap_ratio(errors["rollout"], errors["copy"], tries, seed=0)
     metrics |= {f"{name}_ratio_{end}_{label}": value for end, value in zip(("low", "high"), interval)}
     copied = metrics[f"{name}_copy_cm_{label}"]
     metrics[f"{name}_ratio_{label}"] = metrics[f"{name}_rollout_cm_{label}"] / copied if copied > 0 else float("nan")

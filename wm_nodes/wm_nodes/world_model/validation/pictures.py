@@ -41,7 +41,7 @@ def picture_metrics(models: WorldModels, imagined: ImaginedEpisodes, episodes: E
     feature_ratio: distance of the rollout to the recording over that of the first frame: 1 is as good as copying it.
     feature_floor: the same of recorded frames that are encoded and decoded, which a rollout can hardly undercut.
     other_actions: distance under the next episode's actions over that under the recorded ones, of episodes whose
-    actions differ: 1 where actions are ignored. `_low`, `_high`: 95 %, bootstrap over episodes.
+    actions differ: 1 where actions are ignored. `_low`, `_high`: 95 %, bootstrap over tries.
     varying_error: see there, of encoded and decoded frames, at these steps and of the first ones (h00).
     """
     tokenizer, others = models.tokenizer, np.roll(episodes.actions, 1, axis=0)
@@ -67,8 +67,11 @@ def picture_metrics(models: WorldModels, imagined: ImaginedEpisodes, episodes: E
         metrics[f"varying_error_h{horizon:02d}"] = varying_error(reconstructed, episodes.images[rows, horizon])
         metrics[f"feature_episodes_h{horizon:02d}"] = float(len(rows))
         metrics[f"feature_floor_h{horizon:02d}"] = _ratio(floor, copied)
-        for name, top, bottom in (("feature_ratio", rolled, copied), ("other_actions", misled_by, rolled[both])):
-            low, high = bootstrap_ratio(top, bottom, seed=0)
+        tries = episodes.independent[rows]
+        for name, top, bottom, groups in (
+            ("feature_ratio", rolled, copied, tries), ("other_actions", misled_by, rolled[both], tries[both]),
+        ):
+            low, high = bootstrap_ratio(top, bottom, groups, seed=0)
             metrics |= {
                 f"{name}_h{horizon:02d}": _ratio(top, bottom), f"{name}_low_h{horizon:02d}": low,
                 f"{name}_high_h{horizon:02d}": high,
