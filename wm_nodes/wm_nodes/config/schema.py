@@ -252,8 +252,8 @@ class SftConfig(SettingsSection):
     weight_decay: NonNegativeFloat
     """Of AdamW."""
     heldout: Fraction
-    """Share of the demonstrations that are not learned: the weights with the least error on them are kept. 0: those of
-    the last gradient step."""
+    """Share of the demonstrations, and of the recoveries, that are not learned: the weights with the least error on
+    them are kept. 0: those of the last gradient step."""
     bags: list[str] = Field(default=[])
     """Recordings whose successful episodes are the demonstrations, whoever acted; empty: MPLib plans them."""
     scenes: ScenesName = ""

@@ -136,13 +136,13 @@ def train_weak_policy(
     if more := [*recoveries]:
         recovered = (e for bag in more for e in read_episodes(bag, expected=spec))
         demos += demonstrations(recovered, config.sft.recoveries, RECOVERY, "sft.recoveries")
+    twin = None
     if config.sft.state_noise_m and is_read(config):
-        reader = load_object_reader(Path(config.simulation.object_state), spec)
-        demos = [twin for demo in demos for twin in (demo, as_read(demo, reader))]
+        twin = partial(as_read, reader=load_object_reader(Path(config.simulation.object_state), spec))
     sees = policy.encoder.feature_dim > 0
     shown = make_reconstruct(model_dir, config.device) if sees else None
     lengths = [i for i in spec.measured if spec.state_units[i] == "m"]
-    train_sft(policy, demos, config.sft, config.seed, reconstruct=shown, noisy=lengths)
+    train_sft(policy, demos, config.sft, config.seed, reconstruct=shown, noisy=lengths, twin=twin)
     save_weights(policy, path, {"tokenizer_sha256": policy.encoder.sha256})
     return policy
 
