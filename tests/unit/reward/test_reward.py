@@ -19,12 +19,12 @@ from wm_nodes.reward import (
     EndogenousReward,
     RewardInput,
     RuleReward,
-    pixel_l1,
 )
 from wm_nodes.reward.base import version_of
 
 SIDE_PX = 8
 RANDOM = np.random.default_rng(0)
+pixel_l1 = EncoderDistance(lambda images: images.float(), scale=255.0)
 
 
 def grey(*levels: int) -> UInt8Array:
