@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 import torch
 from pushing_scene import episode, stacked_scene
+from recording_samples import make_episode
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.object_state import READER, of_demonstrations, with_reader, with_truth
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.environments.object_reader import ObjectReader, keypoints, load_object_reader
 from wm_nodes.environments.registry import configured_spec
+from wm_nodes.policy_rl.initial_policy import as_read
 from wm_nodes.policy_rl.object_reader import train_object_reader
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.weights import save_weights
@@ -80,6 +82,16 @@ def test_what_was_at_the_start_of_a_clip_is_read_off_its_first_picture() -> None
     filled = ObjectReader(spec).fill_clip(images, np.zeros((3, spec.state_dim), np.float32))
     now, start = (filled[:, spec.state_names.index(name)] for name in ("object_x", "object_start_x"))
     assert (start == now[0]).all() and len(set(now)) == 3
+
+
+def test_a_demonstration_as_read_says_of_the_start_what_its_first_picture_shows() -> None:
+    spec = configured_spec(load_config("base", {"task": "all_tasks", "simulation.object_state": "truth"}))
+    demo = make_episode(spec, 0, steps=4)
+    states = as_read(demo, ObjectReader(spec)).states
+    for axis in "xy":
+        now, start = (states[:, spec.state_names.index(name)] for name in (f"object_{axis}", f"object_start_{axis}"))
+        assert (start == now[0]).all() and len(set(now)) == 5
+    assert (states[:, : spec.commanded_dim] == demo.states[:, : spec.commanded_dim]).all()
 
 
 def test_states_say_the_truth_while_a_model_is_made_and_then_what_its_reader_sees(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Behaviour cloning of a scripted expert in the toy: learns it, exactly repeatable, expert data only."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from rl_toys import toy_policy
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import SftConfig
 from wm_nodes.core.types import RECOVERY, TAKEN_OVER, Episode, UInt8Array
+from wm_nodes.policy_rl import behaviour_cloning
 from wm_nodes.policy_rl.behaviour_cloning import demonstrations, train_sft
+from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.validation.evaluation import evaluate
 
 
@@ -109,8 +112,26 @@ def test_the_weights_with_the_least_error_on_held_out_demonstrations_are_kept() 
     stopped = toy_policy()
     train_sft(stopped, wrong[:6], longer.model_copy(update={"num_iterations": best, "heldout": 0.0}), 0)
     assert all(torch.equal(policy.state_dict()[name], value) for name, value in stopped.state_dict().items())
-    with pytest.raises(ValueError, match=r"sft\.heldout 0.1 of 2 demonstrations is 0"):
+    with pytest.raises(ValueError, match=r"sft\.heldout 0.1 of 2 expert demonstrations is 0"):
         train_sft(toy_policy(), DEMOS[:2], settings(heldout=0.1), 0)
+
+
+def test_of_each_behaviour_a_share_is_held_out_and_twins_stay_on_one_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    sides, frames = list[list[tuple[int, str]]](), behaviour_cloning._frames
+
+    def noted(policy: ImagePolicy, demos: list[Episode], *rest: Any) -> Any:
+        sides.append([(demo.seed, demo.behaviour) for demo in demos])
+        return frames(policy, demos, *rest)
+
+    monkeypatch.setattr(behaviour_cloning, "_frames", noted)
+    recoveries = [replace(demo, behaviour=RECOVERY, extra={TAKEN_OVER: 1}) for demo in DEMOS[10:14]]
+    once = settings(num_iterations=1, heldout=0.25)
+    train_sft(toy_policy(), [*DEMOS[:8], *recoveries], once, 0, twin=replace)
+    held = [(106, "expert"), (107, "expert"), (113, RECOVERY)]
+    assert sides[1] == [each for each in held for _ in range(2)]
+    assert len(sides[0]) == 18 and not set(sides[0]) & set(sides[1])
+    with pytest.raises(ValueError, match=r"sft\.heldout 0.25 of 1 recovery demonstrations is 0"):
+        train_sft(toy_policy(), [*DEMOS[:8], recoveries[0]], once, 0)
 
 
 def test_weight_decay_and_dropout_change_the_weights_and_are_repeatable() -> None:

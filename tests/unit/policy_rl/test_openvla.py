@@ -14,7 +14,7 @@ from wm_nodes.core.types import Episode, FloatArray, UInt8Array
 from wm_nodes.policy_rl import factories, openvla
 from wm_nodes.policy_rl.behaviour_cloning import train_sft
 from wm_nodes.policy_rl.openvla.model import OpenVlaError
-from wm_nodes.policy_rl.openvla.policy import OpenVlaPolicy
+from wm_nodes.policy_rl.openvla.policy import OpenVlaPolicy, TokenDistribution
 from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.training.weights import load_weights, pack_weights
 
@@ -69,9 +69,22 @@ def test_noise_draws_from_the_law(policy: OpenVlaPolicy) -> None:
         actions = distribution.executed(noise)
         tokens = torch.from_numpy(policy._tokenizer.encode(actions.numpy()))
         likely = distribution.log_probabilities(tokens[:1].repeat(count, 1))[0, 0].exp()
-    shares = torch.bincount(tokens[:, 0] - policy.actor.first_id, minlength=256) / count
-    # the two ends of the range share a bin's middle (decode), so the last two places are one
-    np.testing.assert_allclose(shares[2:].numpy(), likely[2:].numpy(), atol=2 / count)
+    shares = torch.bincount(tokens[:, 0] - policy.actor.first_id - 1, minlength=255) / count
+    np.testing.assert_allclose(shares.numpy(), likely.numpy(), atol=2 / count)
+
+
+def test_an_actions_likelihood_is_that_of_all_tokens_that_are_executed_so(policy: OpenVlaPolicy) -> None:
+    """1 is cloned, 254/255 is executed: their two tokens are one."""
+    ids = policy.actor.first_id + torch.arange(256)[:, None]
+    images = torch.from_numpy(pictures(1)[:, :, :64].repeat(256, 0))
+    actions = torch.from_numpy(policy._tokenizer.decode(ids.numpy()))
+    law = TokenDistribution(policy.actor, policy._tokenizer, images, 1)
+    with torch.no_grad():
+        raw_V = policy.actor.action_logits(images[:1], ids[:1])[0][0, 0].softmax(-1)
+        found, of_one = law.logprob(actions).exp(), law.logprob(torch.ones(256, 1)).exp()
+    torch.testing.assert_close(found, (actions == actions.T).float() @ raw_V)
+    assert found[0] == found[1] == of_one[0] and len(actions.unique()) == 255
+    torch.testing.assert_close(found[1:].sum(), torch.tensor(1.0))
 
 
 def test_the_picture_is_the_leftmost_square_and_the_instruction_is_read(folder: Path, policy: OpenVlaPolicy) -> None:

@@ -17,7 +17,7 @@ from wm_nodes.policy_rl.rescoring import model_of_run, rescore_bag
 from wm_nodes.recording import BagError, topics
 from wm_nodes.recording import messages as m
 from wm_nodes.recording.layout import Tiles
-from wm_nodes.reward import EndogenousReward, RewardInput, RewardModel, RuleReward, pixel_l1
+from wm_nodes.reward import EncoderDistance, EndogenousReward, RewardInput, RewardModel, RuleReward
 from wm_nodes.training.run_record import RunRecord
 
 
@@ -62,7 +62,8 @@ class JudgedGraph(Graph):
         return message
 
 
-MODELS: list[RewardModel] = [RuleReward(2.0), EndogenousReward(load_config("smoke").reward, pixel_l1)]
+PIXELS = EncoderDistance(lambda images: images.float(), scale=255.0)
+MODELS: list[RewardModel] = [RuleReward(2.0), EndogenousReward(load_config("smoke").reward, PIXELS)]
 
 
 def recorded_run(path: Path, model: RewardModel, **options: Any) -> Path:

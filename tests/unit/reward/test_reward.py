@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RewardConfig
@@ -18,11 +19,12 @@ from wm_nodes.reward import (
     EndogenousReward,
     RewardInput,
     RuleReward,
-    pixel_l1,
 )
+from wm_nodes.reward.base import version_of
 
 SIDE_PX = 8
 RANDOM = np.random.default_rng(0)
+pixel_l1 = EncoderDistance(lambda images: images.float(), scale=255.0)
 
 
 def grey(*levels: int) -> UInt8Array:
@@ -53,9 +55,19 @@ def test_delta_pays_for_coming_closer_charges_for_going_away_and_not_for_staying
     assert judged.weights == {"dense": 0.5, "sparse": 2.0}
 
 
-def test_delta_is_clipped_before_it_is_weighted() -> None:
+def test_delta_is_clipped_above_before_it_is_weighted() -> None:
     judged = EndogenousReward(settings(), pixel_l1).evaluate(step(grey(0, 255), grey(255, 0), goals=grey(255, 255)))
-    np.testing.assert_allclose(judged.dense, [0.1, -0.1])
+    np.testing.assert_allclose(judged.dense, [0.1, -0.5])
+
+
+@pytest.mark.parametrize("mode", ["delta", "progress"])
+def test_no_cycle_is_paid(mode: str) -> None:
+    reward = EndogenousReward(settings(mode=mode), pixel_l1)
+    slowly_there_and_back_at_once = np.float32([0, 0.2, 0.4, 0.6, 0.8, 0])
+    for near in (slowly_there_and_back_at_once, *RANDOM.random((20, 8), np.float32)):
+        lap = np.append(near, near[0])
+        assert reward.approach(lap[:-1], lap[1:]).sum() <= 1e-6
+        assert float(reward.approach(*map(torch.from_numpy, (lap[:-1], lap[1:]))).sum()) <= 1e-6
 
 
 def test_abs_is_the_weighted_similarity_and_not_clipped() -> None:
@@ -154,6 +166,13 @@ def test_the_version_changes_with_every_setting_and_distance() -> None:
     }
     assert len(versions) == 5 and all(0 <= version < 2**64 for version in versions)
     assert EndogenousReward(settings(), pixel_l1).version == EndogenousReward(settings(), pixel_l1).version
+
+
+@pytest.mark.parametrize(("dense", "same"), [({"dense_weight": 0.0}, True), ({"mode": "abs"}, True), ({}, False)])
+def test_what_was_paid_when_falling_back_was_clipped_is_another_version(dense: dict[str, Any], same: bool) -> None:
+    config = settings(**dense)
+    former = version_of("endogenous", config.model_dump_json(), pixel_l1.name)
+    assert (EndogenousReward(config, pixel_l1).version == former) == same
 
 
 def test_wrong_input_is_named() -> None:

@@ -63,20 +63,14 @@ def test_on_another_table_only_the_object_is_foreground_where_it_is_what_differs
     assert whole_table[:20].min() == 5 and whole_table[31, 41] < 5
 
 
-def test_rmse_of_one_half_on_balanced_labels_is_one_half() -> None:
+def test_the_done_loss_of_one_half_on_balanced_labels_is_log_two() -> None:
     logits, labels = torch.zeros(2, 3, 1, 1), torch.tensor([[0.0, 1, 0], [1, 0, 1]]).unsqueeze(-1)
-    assert_close(done_losses(logits, labels, torch.ones(2, 3, 1, 1), "rmse"), torch.tensor(0.5))
-    assert_close(done_losses(logits, labels, torch.ones(2, 3, 1, 1), "bce"), torch.log(torch.tensor(2.0)))
+    assert_close(done_losses(logits, labels, torch.ones(2, 3, 1, 1)), torch.log(torch.tensor(2.0)))
 
 
 def test_masked_steps_do_not_count_in_the_done_loss() -> None:
     logits, labels = torch.tensor([[[[9.0]], [[9.0]]]]), torch.tensor([[[1.0], [0.0]]])
     assert done_losses(logits, labels, torch.tensor([[[[1.0]], [[0.0]]]])) < 1e-3
-
-
-def test_an_unknown_done_loss_is_refused() -> None:
-    with pytest.raises(ValueError, match="'bce' or 'rmse'"):
-        done_losses(torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1), torch.ones(1, 1, 1, 1), "mse")
 
 
 def untrained(episodes: EpisodeArrays) -> LatentEpisodes:

@@ -185,7 +185,7 @@ class RewardConfig(SettingsSection):
     goal_threshold: Fraction
     """tau_goal of RS-6: the text model's done signal above which its frame is the goal."""
     dense_clip: PositiveFloat
-    """The dense reward of one step is clipped to [-dense_clip, dense_clip]."""
+    """Most dense reward of one step; what a step loses is not clipped, so that no cycle is paid."""
     uncertainty_limit: NonNegativeFloat
     """An imagined step above it pays no sparse reward and truncates the episode; 0: off."""
     factory: FactoryName = ""
@@ -252,8 +252,8 @@ class SftConfig(SettingsSection):
     weight_decay: NonNegativeFloat
     """Of AdamW."""
     heldout: Fraction
-    """Share of the demonstrations that are not learned: the weights with the least error on them are kept. 0: those of
-    the last gradient step."""
+    """Share of the demonstrations, and of the recoveries, that are not learned: the weights with the least error on
+    them are kept. 0: those of the last gradient step."""
     bags: list[str] = Field(default=[])
     """Recordings whose successful episodes are the demonstrations, whoever acted; empty: MPLib plans them."""
     scenes: ScenesName = ""

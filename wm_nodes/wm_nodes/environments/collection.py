@@ -1,7 +1,7 @@
 """Collect simulator episodes straight into MCAP bags: parallel, resumable, with progress.
 
 Work is cut into shards of `EPISODES_PER_SHARD` seeds, one bag each, renamed when complete: a second call with the same
-arguments collects only the shards that are missing.
+arguments collects only the shards that are missing. A shard follows from its seeds, not from those before it.
 """
 
 import functools
@@ -24,6 +24,7 @@ from wm_nodes.environments.maniskill.episodes import EXTREME as EXTREME
 from wm_nodes.environments.maniskill.episodes import SCATTERED as SCATTERED
 from wm_nodes.environments.maniskill.episodes import planned_or_scripted_episode, record_episode, recovered_episode
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner
+from wm_nodes.environments.maniskill.scenes import renew_physics
 
 EPISODES_PER_SHARD = 50
 POLICY_LABEL = "policy"
@@ -110,6 +111,8 @@ def behaviour_of(seed: int, shares: dict[str, float]) -> str:
 
 def _collect_shard(path: Path, start: int, stop: int, plan: CollectionPlan, write_shard: WriteShard) -> int:
     env = _worker_environment(plan.task, plan.simulation.model_dump_json(), plan.end_on_success)
+    if not plan.simulation.scenes:  # those of the catalogue are built anew with every episode
+        renew_physics(env.scene)
     act_episode = _make_policy_actor(env, plan) if plan.make_policy else _make_behaviour_actor(env, plan)
     write_shard(path, plan, [act_episode(plan.first_seed + i, i) for i in range(start, stop)])
     return stop - start
@@ -117,8 +120,8 @@ def _collect_shard(path: Path, start: int, stop: int, plan: CollectionPlan, writ
 
 @functools.cache
 def _worker_environment(task: str, simulation_json: str, end_on_success: bool) -> ManiSkillEnvironment:
-    """One simulator per worker process: building it costs seconds. Its physics is not renewed, so that demonstrations,
-    and policies that begin with them, stay what they were.
+    """One simulator per worker process: building it costs seconds. Its physics is renewed with every shard, not with
+    every episode, so that demonstrations, and policies that begin with them, stay what they were.
     """
     config = SimulationConfig.model_validate_json(simulation_json)
     return ManiSkillEnvironment(task, config, 1, end_on_success=end_on_success, new_physics=False)

@@ -27,7 +27,8 @@ class ActionTokenizer:
         self._centres = ((self._edges[1:] + self._edges[:-1]) / 2).astype(np.float32)
 
     def encode(self, actions_BA: FloatArray) -> NDArray[np.int64]:
-        """Token ids (B, A) of normalised actions; the id falls as the action grows.
+        """Token ids (B, A) of normalised actions; the id falls as the action grows. 1 is in the last bin: OpenVLA gives
+        it an id of its own, which decodes as the last bin's.
 
         Raises:
             ValueError: an action outside [-1, 1], or not a number.
@@ -38,7 +39,8 @@ class ActionTokenizer:
                 f"action {actions_BA[~inside].flat[0]:g} lies outside [-1, 1]; actions are normalised, divide by "
                 "EnvSpec.action_scale"
             )
-        ids: NDArray[np.int64] = self.vocabulary - np.digitize(actions_BA, self._edges).astype(np.int64)
+        bins_BA = np.digitize(actions_BA, self._edges).clip(max=NUM_EDGES - 1)
+        ids: NDArray[np.int64] = self.vocabulary - bins_BA.astype(np.int64)
         return ids
 
     def decode(self, tokens_BA: NDArray[np.int64]) -> FloatArray:

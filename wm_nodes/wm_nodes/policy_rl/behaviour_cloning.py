@@ -81,9 +81,11 @@ def expert_from(episode: Episode) -> int:
 def train_sft(
     policy: ImagePolicy, demos: Sequence[Episode], config: SftConfig, seed: int, *,
     reconstruct: Callable[[UInt8Array], UInt8Array] | None = None, noisy: Sequence[int] = (),
+    twin: Callable[[Episode], Episode] | None = None,
 ) -> SftResult:
     """Fit the actor's mean to the demonstrated actions in place; critic and log standard deviation stay. With
-    config.heldout the last demonstrations are not learned, and the weights with the least error on them are kept.
+    config.heldout the last demonstrations of each behaviour are not learned, and the weights with the least error on
+    them are kept. Beside each demonstration that is learned or held out its `twin` is, too.
 
     Steps after the first success are left out: an episode ends there when a policy acts; and those of a recovery before
     its expert has taken over. The demonstrations also set
@@ -99,13 +101,12 @@ def train_sft(
     others = {episode.behaviour for episode in demos} - {EXPERT, RECOVERY}
     if not demos or others:
         raise ValueError(f"behaviour cloning needs {EXPERT} demonstrations, got {len(demos)} with {sorted(others)}")
-    check_finite(demos)
-    num_heldout = round(config.heldout * len(demos))
-    if config.heldout and not 0 < num_heldout < len(demos):
-        raise ValueError(f"sft.heldout {config.heldout} of {len(demos)} demonstrations is {num_heldout}; give a share "
-                         "that holds at least one out and leaves one")
-    learned = _frames(policy, demos[: len(demos) - num_heldout], reconstruct)
-    heldout = _frames(policy, demos[len(demos) - num_heldout :], reconstruct) if num_heldout else None
+    kept, held = _split(demos, config.heldout)
+    if twin:
+        kept, held = ([each for demo in side for each in (demo, twin(demo))] for side in (kept, held))
+    check_finite([*kept, *held])
+    learned = _frames(policy, kept, reconstruct)
+    heldout = _frames(policy, held, reconstruct) if held else None
     policy.fit_normaliser(learned.features_BF)
     optimizer = torch.optim.AdamW(
         policy.actor.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
@@ -135,6 +136,19 @@ def train_sft(
     if heldout:
         policy.load_state_dict(best)
     return SftResult(torch.stack(losses).cpu().numpy(), len(learned.features_BF), errors)
+
+
+def _split(demos: Sequence[Episode], share: float) -> tuple[list[Episode], list[Episode]]:
+    """Those to learn and to hold out, both in order: the last ones of each behaviour are held out."""
+    held = set[int]()
+    for behaviour in sorted({demo.behaviour for demo in demos}):
+        rows = [i for i, demo in enumerate(demos) if demo.behaviour == behaviour]
+        count = round(share * len(rows))
+        if share and not 0 < count < len(rows):
+            raise ValueError(f"sft.heldout {share} of {len(rows)} {behaviour} demonstrations is {count}; give a share "
+                             "that holds at least one out and leaves one")
+        held.update(rows[len(rows) - count :])
+    return [demo for i, demo in enumerate(demos) if i not in held], [demos[i] for i in sorted(held)]
 
 
 def _frames(

@@ -20,7 +20,7 @@ from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import RECOVERY, Episode
 from wm_nodes.environments.collection import CollectionPlan
-from wm_nodes.environments.object_reader import load_object_reader
+from wm_nodes.environments.object_reader import ObjectReader, load_object_reader
 from wm_nodes.environments.record import (
     as_compared,
     collect_plan,
@@ -141,15 +141,20 @@ def train_weak_policy(
     if more := [*recoveries]:
         recovered = (e for bag in more for e in read_episodes(bag, expected=spec))
         demos += demonstrations(recovered, config.sft.recoveries, RECOVERY, "sft.recoveries")
+    twin = None
     if config.sft.state_noise_m and is_read(config):
-        reader = load_object_reader(Path(config.simulation.object_state), spec)
-        demos = [twin for demo in demos for twin in (demo, replace(demo, states=reader.fill(demo.images, demo.states)))]
+        twin = partial(as_read, reader=load_object_reader(Path(config.simulation.object_state), spec))
     sees = policy.encoder.feature_dim > 0
     shown = make_reconstruct(model_dir, config.device) if sees else None
     lengths = [i for i in spec.measured if spec.state_units[i] == "m"]
-    train_sft(policy, demos, config.sft, config.seed, reconstruct=shown, noisy=lengths)
+    train_sft(policy, demos, config.sft, config.seed, reconstruct=shown, noisy=lengths, twin=twin)
     save_weights(policy, path, {"tokenizer_sha256": policy.encoder.sha256})
     return policy
+
+
+def as_read(demo: Episode, reader: ObjectReader) -> Episode:
+    """The demonstration as an environment shows it whose states the reader fills."""
+    return replace(demo, states=reader.fill_clip(demo.images, demo.states))
 
 
 def start_files(run_dir: Path) -> tuple[Path, Path]:

@@ -26,20 +26,6 @@ class Distance(Protocol):
     def __call__(self, images: UInt8Array, others: UInt8Array) -> FloatArray: ...
 
 
-class _PixelL1:
-    name = "pixel_l1"
-
-    def __call__(self, images: UInt8Array, others: UInt8Array) -> FloatArray:
-        """Mean absolute difference of the pixels, [0, 1]."""
-        check_pair(images, others)
-        difference = np.abs(images.astype(np.int16) - others.astype(np.int16))
-        mean: FloatArray = (difference.reshape(len(images), -1).mean(1, dtype=np.float64) / 255).astype(np.float32)
-        return mean
-
-
-pixel_l1: Distance = _PixelL1()
-
-
 @dataclass(frozen=True)
 class EncoderDistance:
     """Mean absolute difference of encoder features, divided by `scale`.

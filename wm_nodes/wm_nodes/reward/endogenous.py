@@ -27,9 +27,10 @@ class EndogenousReward:
     """r = w_d r^d + w_s r^s (RS-8).
 
     Dense (RS-5), with Phi(x) = 1 - Perc(x, goal):
-        delta: Phi(x_{t+1}) - Phi(x_t), clipped: pays for coming closer, nothing for staying close.
+        delta: Phi(x_{t+1}) - Phi(x_t), clipped above: pays for coming closer, nothing for staying close, and no way
+            back to where it began is paid.
         abs: Phi(x_{t+1}), not clipped: its level is the signal.
-        progress: index of the nearest golden frame over that of the goal, difference over the step, clipped.
+        progress: index of the nearest golden frame over that of the goal, difference over the step, clipped above.
     Sparse (RS-7): 1 where the done signal is strictly above the threshold; nothing above the uncertainty limit. It is
     paid once because the environment terminates on the crossing and later steps are invalid.
 
@@ -45,7 +46,9 @@ class EndogenousReward:
 
     @property
     def version(self) -> int:
-        return version_of(self.name, self._config.model_dump_json(), self._distance.name)
+        differences = self._config.dense_weight > 0 and self._config.mode != "abs"
+        clipped = ["clipped above"] if differences else []  # until 2026-11-30 below, too
+        return version_of(self.name, self._config.model_dump_json(), self._distance.name, *clipped)
 
     @property
     def config(self) -> RewardConfig:
@@ -84,8 +87,7 @@ class EndogenousReward:
         progress progress_along; arrays or tensors."""
         if self._config.mode == "abs":
             return after
-        limit = self._config.dense_clip
-        clipped: _Array = (after - before).clip(-limit, limit)
+        clipped: _Array = (after - before).clip(max=self._config.dense_clip)
         return clipped
 
     def _dense(self, step: RewardInput) -> tuple[FloatArray, BoolArray]:

@@ -1,7 +1,8 @@
 """OpenVLA behind the interface of ImagePolicy (RS-10f): what trains and evaluates that trains and evaluates this.
 
-The likelihood of an action is that of its tokens, renormalised over the 256 action tokens; LoRA and value head as in
-RL4VLA. Shapes: B batch, F = H W 3 features of an image: its pixels, A action, V action tokens.
+The likelihood of an action is that of its tokens, renormalised over the 256 action tokens, of which the first two are
+executed alike and count as the second; LoRA and value head as in RL4VLA. Shapes: B batch, F = H W 3 features of an
+image: its pixels, A action, V action tokens.
 """
 
 import copy
@@ -51,11 +52,12 @@ class TokenDistribution:
         normal noise the token at whose quantile Phi(noise) lies."""
 
         def choose(logits_BV: Tensor, place: int) -> Tensor:
+            logs = log_law(logits_BV.double())
             if noise_BA is None:
-                return logits_BV.argmax(-1)
+                return logs.argmax(-1) + 1
             quantile = ndtr(noise_BA[:, place, None].double())
-            below: Tensor = (logits_BV.double().softmax(-1).cumsum(-1) < quantile).sum(-1)
-            return below.clamp(max=NUM_EDGES - 1)
+            below: Tensor = (logs.exp().cumsum(-1) < quantile).sum(-1)
+            return below.clamp(max=NUM_EDGES - 2) + 1
 
         tokens = self._network.generate(self._images, self._action_dim, choose)
         return torch.from_numpy(self._tokenizer.decode(tokens.cpu().numpy())).to(self._images.device)
@@ -65,13 +67,13 @@ class TokenDistribution:
         tokens = self._tokenizer.encode(actions_BA.detach().cpu().numpy().clip(-1, 1))
         self._tokens = torch.from_numpy(tokens).to(self._images.device)
         self._logs = self.log_probabilities(self._tokens)
-        picked = self._logs.gather(-1, (self._tokens - self._network.first_id).unsqueeze(-1))
+        picked = self._logs.gather(-1, (self._tokens - self._network.first_id - 1).unsqueeze(-1))
         return picked.squeeze(-1).sum(-1)
 
     def log_probabilities(self, tokens_BA: Tensor) -> Tensor:
-        """(B, A, V), of each token after those before it."""
+        """(B, A, V - 1) of log_law, of each token after those before it."""
         logits, self.hidden_BD = self._network.action_logits(self._images, tokens_BA)
-        return logits.log_softmax(-1)
+        return log_law(logits)
 
     def entropy(self) -> Tensor:
         """(B,), nats, see the class."""
@@ -89,6 +91,13 @@ class TokenDistribution:
         if self._logs is None or self._tokens is None:
             raise ValueError("entropy and kl of action tokens are about actions; ask for their logprob first")
         return self._logs, self._tokens
+
+
+def log_law(logits: Tensor) -> Tensor:
+    """Log probabilities (..., V - 1) of the action tokens but the first: the second, executed alike, has that of both.
+    """
+    logs = logits.log_softmax(-1)
+    return torch.cat([torch.logaddexp(logs[..., :1], logs[..., 1:2]), logs[..., 2:]], -1)
 
 
 class OpenVlaPolicy(ImagePolicy):

@@ -16,14 +16,9 @@ def done_mask(data: LatentEpisodes, index: Tensor, mask_BT: Tensor, head_mask_BK
     return mask_BT[:, :, None, None] * head_mask_BK[:, None, :, None] * data.labelled[index][:, None, None]
 
 
-def done_losses(logits_BTKJ: Tensor, labels_BTJ: Tensor, mask_BTKJ: Tensor, kind: str = "bce") -> Tensor:
-    """kind "rmse": RS-3, the root of the mean squared error; "bce": binary cross-entropy on the same labels."""
+def done_losses(logits_BTKJ: Tensor, labels_BTJ: Tensor, mask_BTKJ: Tensor) -> Tensor:
+    """Mean binary cross-entropy (RS-3) where the mask is 1, nats."""
     labels, weight = labels_BTJ.unsqueeze(2).expand_as(logits_BTKJ), mask_BTKJ.expand_as(logits_BTKJ)
-    if kind == "rmse":
-        squared = (logits_BTKJ.sigmoid() - labels).square()
-        return ((squared * weight).sum() / weight.sum().clamp_min(1) + 1e-8).sqrt()
-    if kind != "bce":
-        raise ValueError(f"done_loss must be 'bce' or 'rmse', got {kind!r}")
     entropy = F.binary_cross_entropy_with_logits(logits_BTKJ, labels, reduction="none")
     return (entropy * weight).sum() / weight.sum().clamp_min(1)
 

@@ -57,7 +57,7 @@ class RolloutTerms:
 
 def train_action_model(
     tokenizer: Tokenizer, episodes: EpisodeArrays | LatentEpisodes, config: RunConfig, seed: int, run_dir: Path | None,
-    *, model: ActionModel | None = None, done_loss: str = "bce", spec: EnvironmentSpec | None = None,
+    *, model: ActionModel | None = None, spec: EnvironmentSpec | None = None,
 ) -> tuple[ActionModel, dict[str, float]]:
     """Train WM_act on episodes of any behaviour; returns the model (averaged weights) and its last metrics.
 
@@ -104,9 +104,7 @@ def train_action_model(
         rows = torch.arange(len(index), device=index.device)
         with compute_context(tokenizer.device):
             terms = unroll(trained, tokenizer, part, rows, noise, anchors, one_pass=min(steps, num_steps) == 1)
-            losses = rollout_losses(
-                terms, tokenizer, part, rows, part.step_mask.float(), heads[index], settings, done_loss
-            )
+            losses = rollout_losses(terms, tokenizer, part, rows, part.step_mask.float(), heads[index], settings)
             if settings.decoded_weight:
                 frames, images = shown
                 losses |= decoded_losses(terms, tokenizer, part, rows, frames, images, config)
@@ -235,7 +233,7 @@ def roll_out_for_device(
 
 def rollout_losses(
     terms: RolloutTerms, tokenizer: Tokenizer, data: LatentEpisodes, index: Tensor, mask_BT: Tensor,
-    head_mask_BK: Tensor, settings: WorldModelConfig, done_loss: str = "bce",
+    head_mask_BK: Tensor, settings: WorldModelConfig,
 ) -> dict[str, Tensor]:
     """Return the training losses (RS-2 for continuous latents, RS-3, RS-4) of frames 1..T of the episodes `index`.
 
@@ -247,7 +245,7 @@ def rollout_losses(
     errors = F.huber_loss(terms.next_latents, target[:, 1:], delta=HUBER_DELTA, reduction="none").mean(-1)
     losses = {"latent": (errors * weight).sum() / weight.sum()}
     labels = data.success[index][:, 1 : steps + 1].float()
-    losses["done"] = done_losses(terms.done_logits, labels, done_mask(data, index, mask_BT, head_mask_BK), done_loss)
+    losses["done"] = done_losses(terms.done_logits, labels, done_mask(data, index, mask_BT, head_mask_BK))
     probed = tokenizer.read_state_normalised(terms.next_latents.flatten(0, 1))
     truth = torch.where(mask_BT[..., None] > 0, data.truth[index][:, 1 : steps + 1], torch.nan).flatten(0, 1)
     losses["state"] = probe_loss(tokenizer, probed, truth)
