@@ -42,8 +42,12 @@ CYCLE = (
 def cycle(probe: Probe, node: str) -> None:
     """deactivate, clean up, configure and activate a node through its lifecycle service."""
     for transition in CYCLE:
-        request = ChangeState.Request(transition=Transition(id=transition))
-        assert probe.call(ChangeState, f"{node}/change_state", request).success, f"{node}: transition {transition}"
+        change(probe, node, transition)
+
+
+def change(probe: Probe, node: str, transition: int) -> None:
+    request = ChangeState.Request(transition=Transition(id=transition))
+    assert probe.call(ChangeState, f"{node}/change_state", request).success, f"{node}: transition {transition}"
 
 
 @pytest.mark.slow
@@ -58,6 +62,26 @@ def test_an_environment_cleaned_up_and_configured_again_has_a_new_session_and_tr
     assert Client(probe).session != before
     assert train(probe, updates=1).termination_reason == Train.Result.FINISHED
     toy.assert_trained_in_one_process(graph.folder / "policies" / "policy_000003.safetensors", updates=2)
+
+
+@pytest.mark.slow
+def test_an_environment_that_is_deactivated_in_a_rollout_and_activated_again_does_not_end_the_training(
+    graph: Graph, probe: Probe
+) -> None:
+    graph.start_environment()
+    graph.start("policy", policy__factory="toy:make_slow_policy", await_nodes=["environment", "reward_evaluator"])
+    graph.start_reward()
+    graph.start_learner()
+    steps = probe.listen("env/transition")
+    wait_until("active", lambda: probe.value("/wm/environment", "state") == "active")
+    cycle(probe, "environment")  # so that its service is known when the rollout runs
+    handle = probe.send(probe.action(Train, "train"), Train.Goal(updates=1))
+    wait_until("steps", lambda: len(steps) > 2)
+    change(probe, "environment", Transition.TRANSITION_DEACTIVATE)
+    wait_until("a repeated rollout", lambda: probe.value("/wm/learner", "repeated_rollouts"))
+    change(probe, "environment", Transition.TRANSITION_ACTIVATE)
+    assert probe.finish(handle).termination_reason == Train.Result.FINISHED
+    toy.assert_trained_in_one_process(graph.folder / "policies" / "policy_000002.safetensors", updates=1)
 
 
 def test_a_node_says_at_once_that_it_has_stopped_and_that_its_topics_are_new(graph: Graph, probe: Probe) -> None:
