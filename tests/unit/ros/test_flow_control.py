@@ -151,6 +151,34 @@ def test_a_withheld_grant_is_repeated_but_does_not_grow_until_it_is_given_again(
     assert node.sent[-1].granted_seq == 11
 
 
+@pytest.mark.parametrize("goes_on_at", [0, 30])
+def test_a_replay_that_begins_again_is_held_where_the_first_one_was(goes_on_at: int) -> None:
+    node = GrantingNode()
+    grantor, tracker, held_at = ConsumerCredits(node, "env/transition"), GapTracker(), list[int]()  # type: ignore[arg-type]
+    for start in (0, goes_on_at):
+        grantor.withhold(False)
+        for seq in range(start, 200):
+            tracker.observe(1, seq)
+            grantor.record_consumed(tracker)
+            grantor.withhold(seq >= 50)
+            if seq == node.sent[-1].granted_seq:
+                held_at.append(seq)
+                break
+        else:
+            pytest.fail("never held")
+    assert all(50 + 16 - 16 // 4 <= seq <= 50 + 16 for seq in held_at)  # grants are a quarter window apart
+
+
+def test_a_replay_that_begins_again_while_credit_is_withheld_is_held_after_one_window() -> None:
+    node = GrantingNode()
+    grantor, tracker = ConsumerCredits(node, "env/transition", window=8), GapTracker()  # type: ignore[arg-type]
+    for seq in (*range(50), *range(8)):
+        grantor.withhold(seq == 49 or grantor.withheld)
+        tracker.observe(1, seq)
+        grantor.record_consumed(tracker)
+    assert node.sent[-1].granted_seq < 16 and tracker.lost == 0
+
+
 def test_a_silent_peer_is_lost_once_and_a_leaving_one_is_not() -> None:
     peers = PeerWatch("/wm/me", timeout_s=3.0)
     for name in ("/wm/me", "/wm/a", "/wm/b"):

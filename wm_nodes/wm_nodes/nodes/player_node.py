@@ -208,7 +208,7 @@ class PlayerNode(ManagedNode):
 
         try:
             self._await_readers(playback, check)
-            playback.run(publish, tick, check, self._say)
+            playback.run(publish, tick, check, self._say, self._credits.clear)  # other numbers were granted before
         finally:
             self._playback = None
         if playback.damaged:
