@@ -145,6 +145,10 @@ class Playback:
             self._is_held_back = is_held_back
             self._condition.notify_all()
 
+    @property
+    def stopped(self) -> bool:
+        return self._stopped
+
     def stop(self) -> None:
         with self._condition:
             self._stopped = True
