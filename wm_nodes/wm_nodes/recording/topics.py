@@ -28,7 +28,8 @@ IMAGE = _qos(depth=IMAGE_DEPTH)
 """A reliable writer matches reliable readers (learner, recorder) and best-effort ones (RViz, rqt)."""
 
 KEEP_ALL = _qos()
-"""Transitions, rewards, episode events. Its queue has no limit: bounded by credit, never by dropping."""
+"""Transitions, rewards, episode events: bounded by credit. Beyond about 10,000 messages that a reader does not take
+the middleware refuses further ones, which are counted (ros/publishing.py)."""
 
 LATCHED = _qos(depth=1, latched=True)
 GOALS = _qos(depth=CREDIT_WINDOW + 2, latched=True)
