@@ -355,6 +355,24 @@ def full_assembler(left_out: tuple[str, int] = ("", 0)) -> RolloutAssembler:
     return assembler
 
 
+def test_an_environment_that_restarts_while_a_rollout_is_taken_does_not_tear_it(
+    monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assembler = full_assembler()
+    restart, missing = threading.Thread(target=assembler.enter_session, args=(2,)), assembler.missing
+
+    def missing_before_the_restart(*span: int) -> list[int]:
+        found = missing(*span)
+        restart.start()
+        restart.join(0.2)
+        return found
+
+    monkeypatch.setattr(assembler, "missing", missing_before_the_restart)
+    rollout, _ = assembler.take(1, 3, policy_version=3)
+    assert rollout.valid_TN.all()
+    restart.join()
+
+
 def test_a_complete_rollout_is_joined_by_stamp_and_step_id() -> None:
     assembler = full_assembler()
     assert assembler.missing(1, 1, 3) == []
