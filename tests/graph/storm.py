@@ -103,7 +103,6 @@ class Storm:
         qos = QoSProfile(
             reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=100,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-            liveliness_lease_duration=min(end.liveliness_lease_duration for end in ends),
         )
         listened = copy(qos)
         listened.history = HistoryPolicy.KEEP_ALL

@@ -13,11 +13,11 @@ from graph.harness import Graph, Probe, wait_until
 from graph.toy import HOMING_S
 from rclpy.action import ActionServer, CancelResponse
 
+from benchmarks.speed.graph import remote_environments
 from wm_msgs.action import Train
 from wm_msgs.msg import EpisodeEvent
 from wm_msgs.srv import GetEnvSpec
 from wm_nodes.launching.graph_client import GraphClient
-from wm_nodes.nodes.environment.remote_environment import remote_environments
 from wm_nodes.ros.goals import goal_result
 from wm_nodes.ros.wire import PeerLost
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from deadlines import within
+from diagnostic_msgs.msg import DiagnosticArray
 from graph.test_recorder_player import Listener, Peer, Start, peer, replay
 from mcap.reader import make_reader
 from recording_samples import make_episode, make_spec
@@ -78,6 +79,21 @@ def test_topics_that_cannot_be_played_are_left_out_named_and_counted(domain: int
         assert result.termination_reason == Replay.Result.FAILED
         assert f"{topic}: " in result.message and words in result.message and "`topics`" in result.message
     assert ended(player, bag_uri="bag", topics=["/chatter"]).messages == 5
+
+
+def test_the_error_of_a_bag_played_at_start_ends_when_another_is_played(
+    domain: int, tmp_path: Path, peer: Start
+) -> None:
+    write_damaged(tmp_path / "bag")
+    write_foreign(tmp_path / "next")
+    player = peer(domain, "player_node", tmp_path, bag_uri="bag")
+    said = [""]
+    player.node.create_subscription(
+        DiagnosticArray, "/diagnostics", lambda message: said.append(message.status[0].message), 10
+    )
+    player.wait(lambda: "bag bag is damaged" in said[-1], "the error")
+    assert ended(player, bag_uri="next", topics=["/chatter"]).messages == 5
+    player.wait(lambda: said[-1] == "ok", "no error")
 
 
 def test_a_bag_damaged_in_the_middle_is_played_up_to_its_end_and_the_goal_names_the_part(

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rclpy
 from graph import toy
-from graph.harness import Graph, Probe, wait_until
+from graph.harness import MATCH_S, Graph, Probe, wait_until
 from graph.test_environment import Client
 from graph.test_training import train
 from lifecycle_msgs.msg import Transition
@@ -27,6 +28,7 @@ from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.training_run import restore
 from wm_nodes.recording import BagError, recover
 from wm_nodes.ros import calls
+from wm_nodes.ros.qos import topic
 from wm_nodes.ros.wire import ResetCommand
 
 pytestmark = pytest.mark.graph
@@ -42,8 +44,12 @@ CYCLE = (
 def cycle(probe: Probe, node: str) -> None:
     """deactivate, clean up, configure and activate a node through its lifecycle service."""
     for transition in CYCLE:
-        request = ChangeState.Request(transition=Transition(id=transition))
-        assert probe.call(ChangeState, f"{node}/change_state", request).success, f"{node}: transition {transition}"
+        change(probe, node, transition)
+
+
+def change(probe: Probe, node: str, transition: int) -> None:
+    request = ChangeState.Request(transition=Transition(id=transition))
+    assert probe.call(ChangeState, f"{node}/change_state", request).success, f"{node}: transition {transition}"
 
 
 @pytest.mark.slow
@@ -60,6 +66,26 @@ def test_an_environment_cleaned_up_and_configured_again_has_a_new_session_and_tr
     toy.assert_trained_in_one_process(graph.folder / "policies" / "policy_000003.safetensors", updates=2)
 
 
+@pytest.mark.slow
+def test_an_environment_that_is_deactivated_in_a_rollout_and_activated_again_does_not_end_the_training(
+    graph: Graph, probe: Probe
+) -> None:
+    graph.start_environment()
+    graph.start("policy", policy__factory="toy:make_slow_policy", await_nodes=["environment", "reward_evaluator"])
+    graph.start_reward()
+    graph.start_learner()
+    steps = probe.listen("env/transition")
+    wait_until("active", lambda: probe.value("/wm/environment", "state") == "active")
+    cycle(probe, "environment")  # so that its service is known when the rollout runs
+    handle = probe.send(probe.action(Train, "train"), Train.Goal(updates=1))
+    wait_until("steps", lambda: len(steps) > 2)
+    change(probe, "environment", Transition.TRANSITION_DEACTIVATE)
+    wait_until("a repeated rollout", lambda: probe.value("/wm/learner", "repeated_rollouts"))
+    change(probe, "environment", Transition.TRANSITION_ACTIVATE)
+    assert probe.finish(handle).termination_reason == Train.Result.FINISHED
+    toy.assert_trained_in_one_process(graph.folder / "policies" / "policy_000002.safetensors", updates=1)
+
+
 def test_a_node_says_at_once_that_it_has_stopped_and_that_its_topics_are_new(graph: Graph, probe: Probe) -> None:
     heard = probe.listen("run/links")
     graph.start_environment()
@@ -70,6 +96,26 @@ def test_a_node_says_at_once_that_it_has_stopped_and_that_its_topics_are_new(gra
     said = [(links.session, links.active) for links in heard[first:]]
     told = [one for one, before in zip(said, [None, *said], strict=False) if one != before]
     assert [active for _, active in told][:2] == [True, False] and told[-1][1]
+
+
+@pytest.mark.slow
+def test_a_reader_that_takes_nothing_of_ten_thousand_events_ends_no_environment(graph: Graph, probe: Probe) -> None:
+    num_envs = 3340  # a start each, and then an end and a start each: 10,020 events
+    graph.start_environment(num_envs=num_envs)
+    client = Client(probe)
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=graph.domain)
+    deaf, row = rclpy.create_node("deaf", namespace="/wm", context=context), topic("episode")
+    deaf.create_subscription(row.type, row.name, lambda message: None, row.qos)
+    wait_until("matching", lambda: deaf.count_publishers("/wm/episode"))
+    time.sleep(MATCH_S)
+    still = np.zeros((num_envs, 3), np.float32)
+    start = client.reset()
+    again = client.step(client.command(start.step_id + 1, still, reset_mask=np.ones(num_envs, bool)))
+    wait_until("the count", lambda: int(probe.value("/wm/environment", "unsent episode") or 0) > 0)
+    assert client.step(client.command(again.step_id + 1, still)).step_id == again.step_id + 1
+    deaf.destroy_node()
+    rclpy.shutdown(context=context)
 
 
 @pytest.mark.parametrize(

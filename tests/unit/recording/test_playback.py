@@ -84,6 +84,24 @@ def test_a_long_wait_is_said_once_and_ends_by_a_seek(tmp_path: Path) -> None:
     assert said == ["the next message is at 600.000 s of the bag, due in 300 s; seek to go on now"]
 
 
+def test_what_begins_is_called_before_each_pass_and_after_each_seek(tmp_path: Path) -> None:
+    playback = Playback(chatter(tmp_path / "bag", [NOW_NS, NOW_NS + 1]), loop=True)
+    order = list[bytes]()
+
+    def publish(name: str, data: bytes) -> None:
+        order.append(data)
+        if len(order) == 5:
+            playback.seek(0.0)
+
+    def check() -> None:
+        if order.count(b"begins") == 4:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        playback.run(publish, lambda time_ns: None, check, begin=lambda: order.append(b"begins"))
+    assert order == [b"begins", text(0), text(1), b"begins", text(0), b"begins", text(0), text(1), b"begins"]
+
+
 def test_single_messages_are_answered_as_soon_as_one_is_held_back_which_is_counted_once(tmp_path: Path) -> None:
     playback = Playback(chatter(tmp_path / "bag", [NOW_NS + number for number in range(10)]), paused=True)
     published, granted = list[bytes](), threading.Semaphore(3)

@@ -151,6 +151,34 @@ def test_a_withheld_grant_is_repeated_but_does_not_grow_until_it_is_given_again(
     assert node.sent[-1].granted_seq == 11
 
 
+@pytest.mark.parametrize("goes_on_at", [0, 30])
+def test_a_replay_that_begins_again_is_held_where_the_first_one_was(goes_on_at: int) -> None:
+    node = GrantingNode()
+    grantor, tracker, held_at = ConsumerCredits(node, "env/transition"), GapTracker(), list[int]()  # type: ignore[arg-type]
+    for start in (0, goes_on_at):
+        grantor.withhold(False)
+        for seq in range(start, 200):
+            tracker.observe(1, seq)
+            grantor.record_consumed(tracker)
+            grantor.withhold(seq >= 50)
+            if seq == node.sent[-1].granted_seq:
+                held_at.append(seq)
+                break
+        else:
+            pytest.fail("never held")
+    assert all(50 + 16 - 16 // 4 <= seq <= 50 + 16 for seq in held_at)  # grants are a quarter window apart
+
+
+def test_a_replay_that_begins_again_while_credit_is_withheld_is_held_after_one_window() -> None:
+    node = GrantingNode()
+    grantor, tracker = ConsumerCredits(node, "env/transition", window=8), GapTracker()  # type: ignore[arg-type]
+    for seq in (*range(50), *range(8)):
+        grantor.withhold(seq == 49 or grantor.withheld)
+        tracker.observe(1, seq)
+        grantor.record_consumed(tracker)
+    assert node.sent[-1].granted_seq < 16 and tracker.lost == 0
+
+
 def test_a_silent_peer_is_lost_once_and_a_leaving_one_is_not() -> None:
     peers = PeerWatch("/wm/me", timeout_s=3.0)
     for name in ("/wm/me", "/wm/a", "/wm/b"):
@@ -325,6 +353,24 @@ def full_assembler(left_out: tuple[str, int] = ("", 0)) -> RolloutAssembler:
         if left_out != ("image", step_id):
             assembler.put_image(10 * step_id, images(step_id))
     return assembler
+
+
+def test_an_environment_that_restarts_while_a_rollout_is_taken_does_not_tear_it(
+    monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assembler = full_assembler()
+    restart, missing = threading.Thread(target=assembler.enter_session, args=(2,)), assembler.missing
+
+    def missing_before_the_restart(*span: int) -> list[int]:
+        found = missing(*span)
+        restart.start()
+        restart.join(0.2)
+        return found
+
+    monkeypatch.setattr(assembler, "missing", missing_before_the_restart)
+    rollout, _ = assembler.take(1, 3, policy_version=3)
+    assert rollout.valid_TN.all()
+    restart.join()
 
 
 def test_a_complete_rollout_is_joined_by_stamp_and_step_id() -> None:

@@ -49,8 +49,7 @@ def qos_text(qos: QoSProfile) -> str:
     words = [str(qos.depth) if qos.history is HistoryPolicy.KEEP_LAST else "all"]
     words += ["latched"] if qos.durability is DurabilityPolicy.TRANSIENT_LOCAL else []
     words += ["best effort"] if qos.reliability is ReliabilityPolicy.BEST_EFFORT else []
-    lease = qos.liveliness_lease_duration.nanoseconds
-    return ", ".join([*words, *([f"liveliness lease {lease / 1e9:g} s"] if 0 < lease < 1e18 else [])])
+    return ", ".join(words)
 
 
 def test_the_table_has_every_topic_with_its_type_and_qos(repository: Path) -> None:

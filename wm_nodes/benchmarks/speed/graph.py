@@ -1,9 +1,10 @@
 """The same step over DDS and in this process, with as many threads on both sides."""
 
 import os
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -14,10 +15,35 @@ from wm_nodes.config.load import dump_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.policy_rl.factories import make_imagined_environment
 
+if TYPE_CHECKING:
+    from wm_nodes.nodes.environment.remote_environment import RemoteEnvironment
+
 GRAPH_ENVS, GRAPH_THREADS = 16, 1
 """One torch thread per node is the graph's default; the loop in one process gets as many."""
 TIMEOUT_S = 60.0
 DOMAINS = range(60, 102)
+
+
+@contextmanager
+def remote_environments(
+    name: str, run_dir: Path, prefixes: Sequence[str], check: Callable[[], None], *, timeout_s: float
+) -> Iterator[list["RemoteEnvironment"]]:
+    """Environment nodes below /wm, stepped from a node `name` of this process; its executor has a thread of its own."""
+    from rclpy.parameter import Parameter
+
+    from wm_nodes.nodes.environment.remote_environment import RemoteEnvironment
+    from wm_nodes.ros.clients import RosEnvironmentClient
+    from wm_nodes.ros.lifecycle import ManagedNode
+    from wm_nodes.ros.spin import init, spinning
+
+    init([])
+    node = ManagedNode(name, namespace="/wm", parameter_overrides=[Parameter("run_dir", value=str(run_dir))])
+    with spinning(node):
+        try:
+            clients = [RosEnvironmentClient(node, prefix, timeout_s) for prefix in prefixes]
+            yield [RemoteEnvironment(client, check, timeout_s=timeout_s, behaviour=name) for client in clients]
+        finally:
+            node.stop()
 
 
 def measure_graph(config: RunConfig, effort: Effort, folder: Path, model: Path, starts: Path) -> dict[str, Any]:
@@ -27,7 +53,6 @@ def measure_graph(config: RunConfig, effort: Effort, folder: Path, model: Path, 
     from wm_nodes.launching.domain_lock import first_free
     from wm_nodes.launching.graph import Graph, NodeSpec, ParameterValue
     from wm_nodes.launching.runner import Runner
-    from wm_nodes.nodes.environment.remote_environment import remote_environments
 
     config_file = folder / "config.yaml"
     config_file.write_text(dump_config(config), encoding="utf-8")

@@ -5,6 +5,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -144,6 +145,7 @@ class PlayerNode(ManagedNode):
         except BaseException:
             self._playback = None
             raise
+        self.diagnostics.clear_condition("playing")
         return playback
 
     def _playable(self, path: Path, names: list[str]) -> list[str]:
@@ -190,6 +192,8 @@ class PlayerNode(ManagedNode):
 
         def check() -> None:
             nonlocal last_feedback
+            if playback.stopped:
+                raise Cancelled("deactivated")
             if work is None:
                 return
             work.check()
@@ -208,7 +212,7 @@ class PlayerNode(ManagedNode):
 
         try:
             self._await_readers(playback, check)
-            playback.run(publish, tick, check, self._say)
+            playback.run(publish, tick, check, self._say, self._credits.clear)  # other numbers were granted before
         finally:
             self._playback = None
         if playback.damaged:
@@ -230,7 +234,8 @@ class PlayerNode(ManagedNode):
 
     def _play_alone(self, playback: Playback, request: Replay.Goal) -> None:
         try:
-            self._play(playback, request, None)
+            with suppress(Cancelled):
+                self._play(playback, request, None)
             self.get_logger().info(f"played {playback.messages} messages")
         except Exception as error:
             trace = "" if isinstance(error, BagError) else f"\n{traceback.format_exc()}"

@@ -145,6 +145,10 @@ class Playback:
             self._is_held_back = is_held_back
             self._condition.notify_all()
 
+    @property
+    def stopped(self) -> bool:
+        return self._stopped
+
     def stop(self) -> None:
         with self._condition:
             self._stopped = True
@@ -152,7 +156,7 @@ class Playback:
 
     def run(
         self, publish: Publish, tick: Callable[[int], None], check: Callable[[], None] = lambda: None,
-        say: Say = lambda text: None,
+        say: Say = lambda text: None, begin: Callable[[], object] = lambda: None,
     ) -> None:
         """Play to the end, or until stop(), or until check() raises.
 
@@ -161,11 +165,13 @@ class Playback:
             tick: gets the bag's time, ns, before each message and every CLOCK_PERIOD_S.
             check: called many times a second.
             say: gets a sentence for each damaged part, long wait and jump of the recorder's clock.
+            begin: called before the first message of each pass, and before the first one after a seek.
         """
         try:
             with Bag(self._path) as bag:
                 while not self._stopped:
                     start_ns = self._take_seek()
+                    begin()
                     ended = self._play_from(bag, start_ns, publish, tick, check, say)
                     if ended and not (self._loop and (self.messages or start_ns > self.start_ns)):
                         return

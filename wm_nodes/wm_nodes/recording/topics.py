@@ -12,18 +12,15 @@ CREDIT_WINDOW = 16
 IMAGE_DEPTH = 2 * CREDIT_WINDOW
 """The images of a full credit window fit into the writer and into the reader twice, so a paced consumer loses none."""
 
-POLICY_LEASE_S = 3
-"""A policy/version publisher that is silent for longer counts as gone."""
-
 _UNSET = QosTime(0, 0)
 
 
-def _qos(*, depth: int = 0, latched: bool = False, lease_s: int = 0) -> Qos:
+def _qos(*, depth: int = 0, latched: bool = False) -> Qos:
     """depth 0: keep all."""
     return Qos(
         QosHistory.KEEP_LAST if depth else QosHistory.KEEP_ALL, depth, QosReliability.RELIABLE,
         QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE, _UNSET, _UNSET, QosLiveliness.AUTOMATIC,
-        QosTime(lease_s, 0), False,
+        _UNSET, False,
     )
 
 
@@ -31,10 +28,10 @@ IMAGE = _qos(depth=IMAGE_DEPTH)
 """A reliable writer matches reliable readers (learner, recorder) and best-effort ones (RViz, rqt)."""
 
 KEEP_ALL = _qos()
-"""Transitions, rewards, episode events. Its queue has no limit: bounded by credit, never by dropping."""
+"""Transitions, rewards, episode events: bounded by credit. Beyond about 10,000 messages that a reader does not take
+the middleware refuses further ones, which are counted (ros/publishing.py)."""
 
 LATCHED = _qos(depth=1, latched=True)
-POLICY = _qos(depth=1, latched=True, lease_s=POLICY_LEASE_S)
 GOALS = _qos(depth=CREDIT_WINDOW + 2, latched=True)
 """Latched, but deep: an evaluator that lags by a full credit window still gets the goals of every episode."""
 
@@ -66,7 +63,7 @@ GOAL = RecordedTopic("env/goal", "wm_msgs/msg/TaskGoal", GOALS)
 REWARD = RecordedTopic("reward", "wm_msgs/msg/RewardBatch", KEEP_ALL)
 EPISODE = RecordedTopic("episode", "wm_msgs/msg/EpisodeEvent", KEEP_ALL)
 ACTION = RecordedTopic("action", "wm_msgs/msg/ActionBatch", NEWEST)
-POLICY_VERSION = RecordedTopic("policy/version", "wm_msgs/msg/PolicyVersion", POLICY)
+POLICY_VERSION = RecordedTopic("policy/version", "wm_msgs/msg/PolicyVersion", LATCHED)
 REWARD_SUMMARY = RecordedTopic("reward/summary", "wm_msgs/msg/RewardSummary", METRICS)
 LEARNER_METRICS = RecordedTopic("learner/metrics", "wm_msgs/msg/LearnerMetrics", METRICS)
 RUN_STATE = RecordedTopic("run/state", "wm_msgs/msg/RunState", LATCHED, sequenced=False)

@@ -172,12 +172,7 @@ class RosEnvironmentClient:
 
     def step(self, command: StepCommand, check: Check) -> Reply:
         read = partial(calls.reply_of, spec=self._require_spec(), session=self._session)
-        try:
-            return self._ask(self._step, calls.step_request(command), read, ATTEMPT_S, check)
-        except WireError as error:
-            if error.code == ErrorCode.SPEC_MISMATCH:
-                raise PeerLost(f"the environment was restarted: {error}") from None
-            raise
+        return self._ask(self._step, calls.step_request(command), read, ATTEMPT_S, check)
 
     def _require_spec(self) -> EnvironmentSpec:
         if self._spec is None:
@@ -211,10 +206,6 @@ class RosEnvironmentClient:
             if client is self._reset:
                 repeated.await_rest()
             return reply
-        except WireError as error:
-            if error.code == ErrorCode.BUSY:
-                raise PeerLost(f"busy for {self._timeout_s:g} s: {error}") from None
-            raise
         finally:
             repeated.end()
 
@@ -264,13 +255,23 @@ first and after each PeerLost."""
 
 
 def retry_while_busy(attempt: Callable[[float], Reply], timeout_s: float, check: Check) -> Reply:
-    """Return attempt(seconds left), repeated while it raises WireError(BUSY), which is raised after timeout_s."""
+    """Return attempt(seconds left), repeated while it raises WireError(BUSY).
+
+    Raises:
+        PeerLost: the environment is BUSY for timeout_s, NOT_ACTIVE, or another than before (SPEC_MISMATCH): it may come
+            back.
+        WireError: any other refusal.
+    """
     deadline = time.monotonic() + timeout_s
     while True:
         try:
             return attempt(max(0.0, deadline - time.monotonic()))
         except WireError as error:
-            if error.code != ErrorCode.BUSY or time.monotonic() >= deadline:
+            if error.code in (ErrorCode.NOT_ACTIVE, ErrorCode.SPEC_MISMATCH):
+                raise PeerLost(f"the environment was stopped or restarted: {error}") from None
+            if error.code != ErrorCode.BUSY:
                 raise
+            if time.monotonic() >= deadline:
+                raise PeerLost(f"busy for {timeout_s:g} s: {error}") from None
         check()
         time.sleep(BUSY_WAIT_S)

@@ -108,11 +108,13 @@ class ConsumerCredits:
             return
         self._since_grant = 0
         session = self._tracker.session
-        if not (self.withheld and self._granted is not None and self._granted[0] == session):
-            self._granted = session, min(self._tracker.last_seq + self._window, MAX_NUMBER)
+        granted = min(self._tracker.last_seq + self._window, MAX_NUMBER)
+        if self.withheld and self._granted is not None and self._granted[0] == session:
+            granted = min(granted, self._granted[1])  # a player that went back is held sooner
+        self._granted = session, granted
         message = Credit(
             consumer=self._node.get_fully_qualified_name(), topic=self._topic_name, stream_session=session,
-            received_seq=max(self._tracker.last_seq, 0), granted_seq=self._granted[1], lost_total=self._tracker.lost,
+            received_seq=max(self._tracker.last_seq, 0), granted_seq=granted, lost_total=self._tracker.lost,
         )
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)

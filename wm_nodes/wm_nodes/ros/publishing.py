@@ -3,6 +3,7 @@
 import time
 from typing import Any
 
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -18,11 +19,13 @@ class StampedPublisher:
     """A publisher of one row of the QoS table that numbers its messages (session, seq).
 
     Args:
+        node: a ManagedNode, whose diagnostics count what is not sent.
         qos: instead of the row's profile.
     """
 
-    def __init__(self, node: Node, name: str, session: int, qos: QoSProfile | None = None) -> None:
+    def __init__(self, node: Any, name: str, session: int, qos: QoSProfile | None = None) -> None:
         row = topic(name)
+        self._node, self._name = node, name
         self.publisher = node.create_publisher(row.type, row.name, qos or row.qos)
         self._session, self.next_seq = session, 0
 
@@ -32,9 +35,14 @@ class StampedPublisher:
             self._session, self.next_seq = session, 0
 
     def publish(self, message: Any) -> None:
+        """Publish, or count what the middleware refuses: its readers see the gap."""
         message.session, message.seq = self._session, self.next_seq
         self.next_seq += 1
-        self.publisher.publish(message)
+        try:
+            self.publisher.publish(message)
+        except RCLError as error:
+            text = f"{self._name} not sent, is a reader stuck? {error}"
+            self._node.diagnostics.count(f"unsent {self._name}", text=text)
 
 
 def destroy_when_heard(node: Node, publishers: list[Publisher]) -> None:

@@ -68,13 +68,10 @@ class GraphTopic:
 
 def profile_of(qos: Qos) -> QoSProfile:
     """The rclpy profile of a row of recording/topics.py."""
-    profile = QoSProfile(
+    return QoSProfile(
         reliability=ReliabilityPolicy[qos.reliability.name], durability=DurabilityPolicy[qos.durability.name],
         history=HistoryPolicy[qos.history.name], depth=qos.depth, liveliness=LivelinessPolicy[qos.liveliness.name],
     )
-    if qos.liveliness_lease_duration.sec:
-        profile.liveliness_lease_duration = Duration(seconds=qos.liveliness_lease_duration.sec)
-    return profile
 
 
 def _graph_topic(topic: recorded.RecordedTopic, message: type[Any]) -> GraphTopic:

@@ -43,25 +43,26 @@ class GapTracker:
     """Counts the sequence numbers that one consumer of one topic missed.
 
     The first session sets the starting point: what was sent before a consumer joined is not a gap. A session that began
-    after it is expected from 0. Publishers may take turns: each session goes on where it was.
+    after it is expected from 0. Publishers may take turns: each session goes on where it was. Where a player goes back,
+    the numbers go on from there.
     """
 
     session: int | None = None
     """Of the newest message; None before any."""
     last_seq: int = -1
-    """Of that session."""
+    """Of that session; of a message that went back or jumped only when the next one goes on from there."""
     received: int = 0
     """Messages of all sessions."""
     lost: int = 0
     """Over all sessions."""
     jumps: int = 0
-    """Forward by more than MAX_GAP; one is believed when the next message goes on from there."""
+    """Forward by more than MAX_GAP."""
     gaps: list[tuple[int, int, int]] = field(default_factory=list)
     """(session, first missing seq, number of missing seqs), newest last; at most 1000 kept."""
     _last_seqs: dict[int, int] = field(default_factory=dict, repr=False)
     """Newest number of each session."""
     _jumped_to: tuple[int, int] | None = field(default=None, repr=False)
-    """Where the newest jump went."""
+    """Where the newest jump, or way back, went."""
 
     def observe(self, session: int, seq: int) -> int:
         """Note one message; return how many of its session were missed directly before it."""
@@ -74,14 +75,12 @@ class GapTracker:
         self._last_seqs[session] = self._last_seqs.pop(session)  # the newest last, so that it stays longest
         self.session, self.last_seq = session, self._last_seqs[session]
         missing = seq - self.last_seq - 1
-        if missing > MAX_GAP:
-            self.jumps += 1
+        if not 0 <= missing <= MAX_GAP:
+            self.jumps += missing > 0
             goes_on, self._jumped_to = self._jumped_to == (session, seq - 1), (session, seq)
             if not goes_on:
                 return 0
             missing = 0
-        elif missing < 0:
-            return 0
         if missing:
             self.lost += missing
             self.gaps.append((session, self.last_seq + 1, missing))

@@ -3,17 +3,10 @@
 Shapes: N environments, A action.
 """
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
-
 import numpy as np
-from rclpy.parameter import Parameter
 
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
-from wm_nodes.ros.clients import Check, EnvironmentClient, RosEnvironmentClient
-from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.spin import init, spinning
+from wm_nodes.ros.clients import Check, EnvironmentClient
 from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand
 
 
@@ -77,18 +70,3 @@ class RemoteEnvironment:
     def _observation(self, reply: Reply) -> Observation:
         assert reply.images is not None
         return Observation(reply.images, reply.states, reply.episode_ids, self._steps.copy())
-
-
-@contextmanager
-def remote_environments(
-    name: str, run_dir: Path, prefixes: Sequence[str], check: Check, *, timeout_s: float
-) -> Iterator[list[RemoteEnvironment]]:
-    """Environment nodes below /wm, stepped from a node `name` of this process; its executor has a thread of its own."""
-    init([])
-    node = ManagedNode(name, namespace="/wm", parameter_overrides=[Parameter("run_dir", value=str(run_dir))])
-    with spinning(node):
-        try:
-            clients = [RosEnvironmentClient(node, prefix, timeout_s) for prefix in prefixes]
-            yield [RemoteEnvironment(client, check, timeout_s=timeout_s, behaviour=name) for client in clients]
-        finally:
-            node.stop()

@@ -130,8 +130,8 @@ class RolloutAssembler:
         Raises:
             ValueError: not a single step is complete.
         """
-        missing = set(self.missing(self._session, first, last))
         with self._changed:
+            missing = set(self.missing(self._session, first, last))
             joined = self._joiner.joined
             steps = [None if n in missing else joined(self._current.steps[n]) for n in range(first, last + 1)]
         return rollout_of(steps, policy_version)
