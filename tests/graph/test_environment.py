@@ -177,6 +177,31 @@ def test_a_robot_holds_when_a_rollout_leaves_it_within_an_episode(
     assert told(graph)[2] == hold and hold not in told(graph)[:2]
 
 
+def test_a_rollout_ends_where_somebody_else_resets_and_one_after_a_cancelled_one_begins_with_a_reset(
+    graph: Graph, probe: Probe
+) -> None:
+    transitions, endless = probe.listen("env/transition"), Rollout.Goal(steps=100_000, reset=True)
+    graph.start_environment("toy:make_long_environment", num_envs=N)
+    graph.start_policy()
+    client, rollout = Client(probe), probe.action(Rollout, "rollout")
+
+    def begin() -> Any:
+        seen, handle = len(transitions), probe.send(rollout, endless)
+        wait_until("steps", lambda: len(transitions) > seen + 5)
+        return handle
+
+    handle = begin()
+    client.reset()
+    result = probe.finish(handle)
+    assert result.termination_reason == Rollout.Result.PEER_LOST
+    assert "another client has reset environments [0, 1, 2, 3] within the episode" in result.message
+    assert probe.cancel(begin()).termination_reason == Rollout.Result.CANCELED
+    newest = transitions[-1].episode_id[0]
+    result = probe.finish(probe.send(rollout, Rollout.Goal(steps=3)))
+    assert result.termination_reason == Rollout.Result.FINISHED, result.message
+    wait_until("episodes of its own", lambda: transitions[-1].episode_id[0] > newest)
+
+
 @pytest.mark.parametrize("reliability", [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT])
 def test_an_emergency_stop_is_heard_from_a_publisher_that_latches_nothing(
     graph: Graph, probe: Probe, reliability: ReliabilityPolicy

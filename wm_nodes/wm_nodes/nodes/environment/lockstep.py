@@ -107,6 +107,7 @@ class LockstepEnvironment:
         self._clock = clock or StampClock()
         self._stamp_ns = 0
         self._last_step_id = 0
+        self._last_command: StepCommand | None = None
         self._last_reply: Reply | WireError | None = None
         self._last_reset: _Reset | None = None
         self._current: Observation | None = None
@@ -152,7 +153,7 @@ class LockstepEnvironment:
             return reply
 
     def step(self, command: StepCommand) -> Reply:
-        """Step once; the same step_id again returns the stored answer.
+        """Step once; the same command again returns the stored answer.
 
         Raises:
             WireError: SPEC_MISMATCH, OUT_OF_ORDER, BAD_SHAPE, NAN_INPUT, OUT_OF_RANGE, ESTOP, NAN_MODEL, INTERNAL, or
@@ -161,7 +162,7 @@ class LockstepEnvironment:
         """
         with self._lock:
             self._check_client(command)
-            if self._last_reply is None or command.step_id != self._last_step_id:
+            if self._last_reply is None or not command.equals(self._last_command):
                 plan, started = self._plan(command), time.perf_counter()
                 self._last_reset = None
                 result = self._advance(plan)
@@ -170,6 +171,7 @@ class LockstepEnvironment:
                 step = self._lockstep(plan, result, valid)
                 reply = self._answer(plan, step, time.perf_counter() - started)
                 self._publish(plan, step)
+                self._last_command = command
                 self._last_reply = _nan_error(broken, command.step_id) if broken.any() else reply
             if isinstance(self._last_reply, WireError):
                 raise self._last_reply
@@ -238,8 +240,8 @@ class LockstepEnvironment:
         if command.step_id != self.next_step_id:
             raise WireError(
                 ErrorCode.OUT_OF_ORDER,
-                f"step_id {command.step_id} is neither the last one ({self._last_step_id}) nor the next one "
-                f"({self.next_step_id}); continue with {self.next_step_id}",
+                f"step_id {command.step_id} is neither the next one ({self.next_step_id}) nor the last step, sent "
+                f"again; is there a second client? continue with {self.next_step_id}",
             )
         if self._current is None:
             raise WireError(ErrorCode.OUT_OF_ORDER, "never reset; call env/reset first")
