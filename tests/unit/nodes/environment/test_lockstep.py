@@ -272,3 +272,28 @@ def test_an_environment_that_one_client_resets_in_part_is_stepped_on() -> None:
     before = client.reset(np.array([False, True])).episode_id
     after = client.step(np.zeros((N, 3), np.float32)).observation.episode_id
     assert (before == after).all()
+
+
+def test_a_robot_is_left_from_its_last_step_within_an_episode_until_it_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench, now_s = Bench(), 10.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+
+    def left_for_s() -> float:
+        nonlocal now_s
+        now_s += 2.0
+        return bench.served.left_for_s
+
+    assert left_for_s() == 0.0, "what was only reset stays put"
+    bench.served.step(bench.command())
+    assert (left_for_s(), left_for_s()) == (2.0, 4.0)
+    bench.served.reset(ResetCommand())
+    assert left_for_s() == 2.0, "a reset need not end what a step began"
+    bench.served.hold_now()
+    assert left_for_s() == 0.0
+    while bench.served._episodes.running.any():
+        bench.served.step(bench.command())
+    assert left_for_s() == 0.0, "at the end of its episode a robot holds by itself"
+    bench.environment.error = OSError("no answer")
+    with pytest.raises(WireError, match="no answer"):
+        bench.served.step(bench.command())
+    assert left_for_s() == 2.0, "whatever a failed step began"
