@@ -1,6 +1,8 @@
 """Lifecycle transitions that fail, and what else real nodes answer without a graph; in this process."""
 
-from collections.abc import Iterator
+import os
+import signal
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,8 @@ from rclpy.parameter import Parameter
 
 from wm_msgs.action import Replay
 from wm_nodes.config.load import dump_config, load_config
+from wm_nodes.core.specs import SOURCE_REAL
+from wm_nodes.core.types import BoolArray, Observation, UInt64Array
 from wm_nodes.nodes import environment_node
 from wm_nodes.nodes.environment_node import EnvironmentNode
 from wm_nodes.nodes.evaluation_node import EvaluationNode
@@ -21,6 +25,7 @@ from wm_nodes.nodes.policy_node import PolicyNode
 from wm_nodes.nodes.reward_evaluator_node import RewardEvaluatorNode
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.qos import topic
+from wm_nodes.ros.spin import stop_on_signals
 
 pytestmark = pytest.mark.graph
 DONE, FAILED = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -34,11 +39,23 @@ def context(domain: int) -> Iterator[None]:
 
 
 class Robot(TwoCameras):
-    """Counts how often it was closed, and then raises `error`, where there is one."""
+    """Counts how often it was closed, and then raises `error`, where there is one; and how often it was told to hold.
 
-    def __init__(self, error: Exception | None = None) -> None:
+    homing: called in each reset, as it begins.
+    """
+
+    def __init__(self, error: Exception | None = None, homing: Callable[[], object] = lambda: None) -> None:
         super().__init__(1, 0)
-        self.closed, self._error = 0, error
+        self.spec = replace(self.spec, source=SOURCE_REAL)
+        self.closed, self.held, self._error, self._homing = 0, 0, error, homing
+
+    def reset(self, mask: BoolArray | None = None, seeds: UInt64Array | None = None) -> Observation:
+        self._homing()
+        return super().reset(mask, seeds)
+
+    def hold(self) -> None:
+        assert not self.closed
+        self.held += 1
 
     def close(self) -> None:
         self.closed += 1
@@ -50,11 +67,12 @@ class Robot(TwoCameras):
 def make_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     nodes = list[EnvironmentNode]()
 
-    def make(robot: Robot) -> EnvironmentNode:
+    def make(robot: Robot, **parameters: Any) -> EnvironmentNode:
         monkeypatch.setattr(environment_node, "make_environment", lambda *_, **__: robot)
         (tmp_path / "config.yaml").write_text(dump_config(load_config("smoke")), encoding="utf-8")
         nodes.append(EnvironmentNode(parameter_overrides=[
-            Parameter("config_file", value=str(tmp_path / "config.yaml")), Parameter("backend", value="environment")
+            Parameter("config_file", value=str(tmp_path / "config.yaml")), Parameter("backend", value="environment"),
+            *(Parameter(name, value=value) for name, value in parameters.items()),
         ]))
         return nodes[-1]
 
@@ -101,6 +119,44 @@ def test_a_node_whose_robot_cannot_be_closed_is_unconfigured_and_can_be_configur
     assert (state(node), robot.closed) == ("unconfigured", 1)
     assert node.trigger_configure() == DONE and state(node) == "inactive"
     assert node.count_subscribers(topic("safety/estop").name) == 2
+
+
+def interrupt() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_robot_that_a_signal_stops_on_its_way_to_the_first_reset_holds_and_is_closed(make_node: Any) -> None:
+    robot = Robot(homing=interrupt)
+    node = make_node(robot, mode="asynchronous")
+    with stop_on_signals() as stopped:
+        assert not stopped.interrupt(node.start)
+    assert (state(node), robot.held, robot.closed) == ("activating", 0, 0)
+    node.stop()
+    assert (robot.held, robot.closed) == (1, 1)
+
+
+def test_a_robot_is_closed_where_a_signal_stops_the_configuration(
+    make_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = Robot()
+    node = make_node(robot)
+    monkeypatch.setattr(environment_node, "CameraTopics", lambda *_: interrupt())
+    with stop_on_signals() as stopped:
+        assert not stopped.interrupt(node.start)
+    node.stop()
+    assert (state(node), robot.held, robot.closed) == ("configuring", 0, 1)
+
+
+def test_a_robot_whose_first_reset_fails_holds_and_the_reason_stands(make_node: Any) -> None:
+    def block() -> None:
+        raise OSError("the way is blocked")
+
+    robot = Robot(homing=block)
+    node = make_node(robot, mode="asynchronous")
+    assert not node.start() and (state(node), robot.held, robot.closed) == ("inactive", 1, 0)
+    assert "the first reset failed" in condition(node) and "the way is blocked" in condition(node)
+    node.stop()
+    assert (state(node), robot.held, robot.closed) == ("finalized", 1, 1)
 
 
 @pytest.mark.parametrize(

@@ -203,15 +203,14 @@ class LockstepEnvironment:
             WireError: INTERNAL, NAN_MODEL: the environment failed.
         """
         with self._lock, self._environment_errors():
-            self._told_s = None
-            if self._current is None or self.spec.source == SOURCE_IMAGINED:
-                return np.zeros(self.spec.num_envs, bool)
-            if self.is_robot and (hold := getattr(self.environment, "hold", None)):
+            is_untouched, self._told_s = self._current is None and self._told_s is None, None
+            if self.is_robot and not is_untouched and (hold := getattr(self.environment, "hold", None)):
                 hold()
-                return np.zeros(self.spec.num_envs, bool)
-            result = self.environment.step(self.hold_actions())
-            self._episodes.count_hold()
-            return result.terminated | result.truncated
+            elif self._current is not None and self.spec.source != SOURCE_IMAGINED:
+                result = self.environment.step(self.hold_actions())
+                self._episodes.count_hold()
+                return result.terminated | result.truncated
+            return np.zeros(self.spec.num_envs, bool)
 
     def hold_actions(self) -> FloatArray:
         """Actions (N, A) that leave every tool where it is commanded to be; zeros before the first reset."""
