@@ -147,6 +147,15 @@ def test_a_robot_is_closed_where_a_signal_stops_the_configuration(
     assert (state(node), robot.held, robot.closed) == ("configuring", 0, 1)
 
 
+def test_actions_that_would_always_be_too_old_are_refused_before_the_first_reset(make_node: Any) -> None:
+    robot = Robot(homing=lambda: pytest.fail("it was reset"))
+    node = make_node(robot, mode="asynchronous", control_period_s=0.5)
+    assert not node.start() and state(node) == "inactive" and robot.held == 0
+    assert "max_action_age_s 0.3 is not above the control period of 0.5 s" in condition(node)
+    assert "raise max_action_age_s, or lower control_period_s" in condition(node)
+    node.stop()
+
+
 def test_a_robot_whose_first_reset_fails_holds_and_the_reason_stands(make_node: Any) -> None:
     def block() -> None:
         raise OSError("the way is blocked")

@@ -124,13 +124,17 @@ class EnvironmentNode(ManagedNode):
                 steady = Clock(clock_type=ClockType.STEADY_TIME)
                 self._timer = self.create_timer(HOLD_AFTER_S / 4, self._on_watch, clock=steady)
             return
+        self._period_s = float(self.param("control_period_s")) or self._spec.control_period_s
+        if (max_age_s := float(self.param("max_action_age_s"))) <= self._period_s:
+            raise ValueError(
+                f"max_action_age_s {max_age_s:g} is not above the control period of {self._period_s:g} s: every action "
+                "would be too old in the next step; raise max_action_age_s, or lower control_period_s"
+            )
         try:
             self._asynchronous.start()
         except WireError as error:
             raise ValueError(f"the first reset failed: {error}") from None
-        period_s = float(self.param("control_period_s")) or self._spec.control_period_s
-        self._period_s = period_s
-        self._timer = self.create_timer(period_s, self._on_tick)
+        self._timer = self.create_timer(self._period_s, self._on_tick)
 
     def deactivate(self, reason: str) -> None:
         if self._timer is not None:
