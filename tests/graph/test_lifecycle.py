@@ -3,19 +3,24 @@
 import os
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import rclpy
 from graph.toy import TwoCameras
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from unit.nodes.environment.test_lockstep import Bench, N
 
 from wm_msgs.action import Replay
 from wm_nodes.config.load import dump_config, load_config
-from wm_nodes.core.specs import SOURCE_REAL
+from wm_nodes.core.errors import WireError
+from wm_nodes.core.lockstep import Goals
+from wm_nodes.core.specs import SOURCE_REAL, EnvironmentSpec
 from wm_nodes.core.types import BoolArray, Observation, UInt64Array
 from wm_nodes.nodes import environment_node
 from wm_nodes.nodes.environment_node import EnvironmentNode
@@ -23,6 +28,7 @@ from wm_nodes.nodes.evaluation_node import EvaluationNode
 from wm_nodes.nodes.player_node import PlayerNode
 from wm_nodes.nodes.policy_node import PolicyNode
 from wm_nodes.nodes.reward_evaluator_node import RewardEvaluatorNode
+from wm_nodes.ros import convert
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.spin import stop_on_signals
@@ -176,6 +182,43 @@ def test_a_parameter_that_only_configure_reads_cannot_be_set_while_the_node_runs
     node = make()
     refused = node.set_parameters_atomically([Parameter(name, value=2.5)])
     assert not refused.successful and f"start it again with {name}:=2.5" in refused.reason
+    node.destroy_node()
+
+
+def test_a_second_spec_of_one_session_is_refused_and_the_reward_evaluator_goes_on(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text(dump_config(load_config("smoke")), encoding="utf-8")
+    given = {"config_file": str(tmp_path / "config.yaml"), "reward": "rule", "image_wait_s": 60.0}
+    node = RewardEvaluatorNode(parameter_overrides=[Parameter(name, value=value) for name, value in given.items()])
+    assert node.trigger_configure() == DONE and node.trigger_activate() == DONE
+    bench = Bench()
+    bench.served.step(bench.command())
+    spec, step = bench.served.spec, convert.transition_msg(bench.transitions[-1])
+    step.session, step.episode_id = 1, convert.to_field(np.array([1, 2], np.uint64))
+
+    def announce(session: int, spec: EnvironmentSpec, episode_id: int) -> None:
+        """A spec, and a goal of its size for one episode."""
+        message = convert.spec_msg(spec, 1)
+        message.session = session
+        node._on_spec(message)
+        images, ids = np.zeros((N, spec.height, spec.width, 3), np.uint8), np.full(N, episode_id, np.uint64)
+        goal = convert.goal_msg(Goals(1, images, np.ones(N, bool), ids, session), spec)
+        goal.session = session
+        with suppress(WireError):  # of another size than the spec in force
+            node._on_goal(goal)
+
+    larger = replace(spec, height=2 * spec.height)
+    announce(1, spec, 1)
+    announce(1, spec, 1)
+    announce(1, larger, 2)
+    node._on_transition(step)
+    assert node._joiner._waiting
+    node.set_parameters([Parameter("image_wait_s", value=0.0)])
+    node._on_timer()
+    assert not node._joiner._waiting
+    assert node.diagnostics._counters["refused_specs"] == 1
+    announce(2, larger, 2)
+    assert node._spec == larger
+    node.stop()
     node.destroy_node()
 
 
