@@ -297,3 +297,9 @@ def test_a_robot_is_left_from_its_last_step_within_an_episode_until_it_holds(mon
     with pytest.raises(WireError, match="no answer"):
         bench.served.step(bench.command())
     assert left_for_s() == 2.0, "whatever a failed step began"
+    bench.served.hold_now()
+    bench.served.reset(ResetCommand())
+    assert left_for_s() == 0.0
+    bench.served.end_episodes(EpisodeEvent.REASON_ESTOP)
+    bench.served.step(bench.command())
+    assert left_for_s() == 2.0, "an episode that was ended from outside is no rest"

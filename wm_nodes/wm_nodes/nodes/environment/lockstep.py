@@ -175,7 +175,8 @@ class LockstepEnvironment:
                 reply = self._answer(plan, step, time.perf_counter() - started)
                 self._publish(plan, step)
                 self._last_command = command
-                self._told_s = time.monotonic() if self._episodes.running.any() else None
+                goes_on = result.valid & ~result.terminated & ~result.truncated
+                self._told_s = time.monotonic() if goes_on.any() else None
                 self._last_reply = _nan_error(broken, command.step_id) if broken.any() else reply
             if isinstance(self._last_reply, WireError):
                 raise self._last_reply
