@@ -222,6 +222,17 @@ def test_a_second_spec_of_one_session_is_refused_and_the_reward_evaluator_goes_o
     node.destroy_node()
 
 
+def test_a_node_that_calls_itself_failed_as_it_is_activated_has_not_started() -> None:
+    class Node(ManagedNode):
+        def activate(self) -> None:
+            self.failed = True
+
+    node = Node("node")
+    assert not node.start() and node.failed and state(node) == "active"
+    node.stop()
+    node.destroy_node()
+
+
 def test_a_bag_that_cannot_be_played_on_for_whatever_reason_is_an_error_of_the_player(
     monkeypatch: pytest.MonkeyPatch
 ) -> None:

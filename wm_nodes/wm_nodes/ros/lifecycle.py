@@ -256,7 +256,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             self.get_logger().info("unconfigured; a lifecycle manager configures and activates this node")
             return True
         done = TransitionCallbackReturn.SUCCESS
-        self.failed |= self.trigger_configure() != done or self.trigger_activate() != done
+        self.failed = self.trigger_configure() != done or self.trigger_activate() != done or self.failed
         return not self.failed
 
     def is_settled(self, stop_s: float) -> bool:
