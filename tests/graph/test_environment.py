@@ -1,5 +1,6 @@
 """The environment node over DDS: lock-step rules, refusals, late joiners."""
 
+import time
 from dataclasses import replace
 from typing import Any
 
@@ -15,6 +16,7 @@ from wm_msgs.msg import EpisodeEvent, ErrorCode
 from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
 from wm_nodes.core.errors import WireError
 from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.nodes.environment_node import HOLD_AFTER_S
 from wm_nodes.recording.messages import images_of
 from wm_nodes.ros import calls, convert
 from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand
@@ -175,6 +177,45 @@ def test_a_robot_holds_when_a_rollout_leaves_it_within_an_episode(
     assert result.termination_reason == Rollout.Result.FINISHED, result.message
     wait_until("the hold", lambda: len(told(graph)) == 3)
     assert told(graph)[2] == hold and hold not in told(graph)[:2]
+
+
+@pytest.mark.kills
+def test_a_robot_holds_once_when_its_client_dies_within_an_episode(graph: Graph, probe: Probe) -> None:
+    graph.start_environment("toy:make_robot", num_envs=1)
+    graph.start_policy()
+    probe.send(probe.action(Rollout, "rollout"), Rollout.Goal(steps=100_000, reset=True))
+    wait_until("motion", lambda: len(told(graph)) > 5)
+    graph.kill("/wm/policy")
+    wait_until("the hold", lambda: told(graph)[-1] == "told 0")
+    made = len(told(graph))
+    wait_until("the count", lambda: probe.value("/wm/environment", "idle_holds") == "1")
+    time.sleep(2 * HOLD_AFTER_S)
+    assert len(told(graph)) == made and "no step came for 1 s within an episode" in graph.log("/wm/environment")
+
+
+def test_a_rollout_ends_where_somebody_else_resets_and_one_after_a_cancelled_one_begins_with_a_reset(
+    graph: Graph, probe: Probe
+) -> None:
+    transitions, endless = probe.listen("env/transition"), Rollout.Goal(steps=100_000, reset=True)
+    graph.start_environment("toy:make_long_environment", num_envs=N)
+    graph.start_policy()
+    client, rollout = Client(probe), probe.action(Rollout, "rollout")
+
+    def begin() -> Any:
+        seen, handle = len(transitions), probe.send(rollout, endless)
+        wait_until("steps", lambda: len(transitions) > seen + 5)
+        return handle
+
+    handle = begin()
+    client.reset()
+    result = probe.finish(handle)
+    assert result.termination_reason == Rollout.Result.PEER_LOST
+    assert "another client has reset environments [0, 1, 2, 3] within the episode" in result.message
+    assert probe.cancel(begin()).termination_reason == Rollout.Result.CANCELED
+    newest = transitions[-1].episode_id[0]
+    result = probe.finish(probe.send(rollout, Rollout.Goal(steps=3)))
+    assert result.termination_reason == Rollout.Result.FINISHED, result.message
+    wait_until("episodes of its own", lambda: transitions[-1].episode_id[0] > newest)
 
 
 @pytest.mark.parametrize("reliability", [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT])

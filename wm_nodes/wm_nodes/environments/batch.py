@@ -32,8 +32,9 @@ class SingleEnvironment(Protocol):
     """What has to be written for an environment.
 
     A robot may also have `hold() -> None`: stay where it is. It is called at an emergency stop, at deactivation, in a
-    wait for credit, and when an episode or a rollout ends. Without it the robot is stepped with action 0 instead, which
-    must then mean to stay: it does not where commands are absolute, or 0 is the middle of limits such as 0 to 0.08 m.
+    wait for credit, after a second without a step, and when an episode or a rollout ends. Without it the robot is
+    stepped with action 0 instead, which must then mean to stay: it does not where commands are absolute, or 0 is the
+    middle of limits such as 0 to 0.08 m.
     """
 
     def reset(self, seed: int) -> Frame:

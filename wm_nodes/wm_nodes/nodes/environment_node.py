@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.clock import Clock, ClockType
 from rclpy.timer import Timer
 from sensor_msgs.msg import Image
 from std_msgs.msg import Bool
@@ -41,6 +42,9 @@ MODES = ("lockstep", "asynchronous")
 
 MAX_MOSAIC_BYTES = 96 * 2**20
 """Largest env/image that was tried: it arrives, in about a second. Writer and readers keep up to 32 of them."""
+
+HOLD_AFTER_S = 1.0
+"""A robot in lock-step that within an episode was told nothing more for so long holds: its client may have died."""
 
 PARAMS = (
     Param("backend", "world_model", "What is stepped: a model, or by the configuration environment.factory, or "
@@ -116,14 +120,21 @@ class EnvironmentNode(ManagedNode):
 
     def activate(self) -> None:
         if self._asynchronous is None:
+            if self._ready().is_robot:
+                steady = Clock(clock_type=ClockType.STEADY_TIME)
+                self._timer = self.create_timer(HOLD_AFTER_S / 4, self._on_watch, clock=steady)
             return
+        self._period_s = float(self.param("control_period_s")) or self._spec.control_period_s
+        if (max_age_s := float(self.param("max_action_age_s"))) <= self._period_s:
+            raise ValueError(
+                f"max_action_age_s {max_age_s:g} is not above the control period of {self._period_s:g} s: every action "
+                "would be too old in the next step; raise max_action_age_s, or lower control_period_s"
+            )
         try:
             self._asynchronous.start()
         except WireError as error:
             raise ValueError(f"the first reset failed: {error}") from None
-        period_s = float(self.param("control_period_s")) or self._spec.control_period_s
-        self._period_s = period_s
-        self._timer = self.create_timer(period_s, self._on_tick)
+        self._timer = self.create_timer(self._period_s, self._on_tick)
 
     def deactivate(self, reason: str) -> None:
         if self._timer is not None:
@@ -253,6 +264,14 @@ class EnvironmentNode(ManagedNode):
         self.diagnostics.latency("step", spent)
         if spent > self._period_s:
             self.diagnostics.count("overruns", text=f"a step took {spent:.3f} s, the control period is less")
+
+    def _on_watch(self) -> None:
+        """Have a robot hold, once, where no client goes on with its episode."""
+        if self._ready().left_for_s > HOLD_AFTER_S:
+            self._hold()
+            text = f"no step came for {HOLD_AFTER_S:g} s within an episode; the robot holds"
+            self.get_logger().warning(text)
+            self.diagnostics.count("idle_holds", text=text)
 
     def _on_estop(self, message: Bool) -> None:
         if self.served is None or message.data == self._estop:

@@ -31,7 +31,7 @@ from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.qos import LIVE_ACTION
 from wm_nodes.ros.spin import run_node
-from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand
+from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand
 from wm_nodes.ros.worker import Work
 
 FEEDBACK_S = 0.5
@@ -119,7 +119,7 @@ class PolicyNode(ManagedNode):
     def _rollout(self, work: Work, result: Rollout.Result) -> None:
         try:
             self._act(work, result)
-        except (PeerLost, WireError, ValueError):
+        except Exception:
             self._last_reply = None
             raise
         finally:
@@ -157,7 +157,7 @@ class PolicyNode(ManagedNode):
                 )
             step_id = reply.step_id + 1
             self._publish_actions(reply.stamp_ns, step_id, output, acting, infer_s)
-            began = time.perf_counter()
+            began, before = time.perf_counter(), reply
             reply = self._environment.step(
                 StepCommand(
                     session=reply.session, step_id=step_id, spec_hash=spec.spec_hash,
@@ -167,6 +167,7 @@ class PolicyNode(ManagedNode):
                 ),
                 work.check,
             )
+            reply.check_follows(before, ended)
             self.diagnostics.latency("infer", infer_s)
             self.diagnostics.latency("step", time.perf_counter() - began)
             self._last_reply = reply

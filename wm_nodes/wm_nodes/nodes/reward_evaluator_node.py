@@ -63,7 +63,7 @@ class RewardEvaluatorNode(ManagedNode):
         else:
             self._model = make_reward(kind, config, str(self.param("model_dir")))
         self._spec: EnvironmentSpec | None = None
-        self._session = 0
+        self._session = self._spec_session = 0
         self._joiner = Joiner(with_goals=True)
         self._window = SummaryWindow()
         self._rewards = self.publish_on("reward")
@@ -101,10 +101,19 @@ class RewardEvaluatorNode(ManagedNode):
     def _on_spec(self, message: EnvSpec) -> None:
         try:
             check_session(message.session)
-            self._spec = convert.spec_from_msg(message)
+            spec = convert.spec_from_msg(message)
+            known = spec.spec_hash if self._spec is None else self._spec.spec_hash
+            if known != spec.spec_hash and message.session == self._spec_session:
+                raise WireError(
+                    ErrorCode.SPEC_MISMATCH,
+                    f"session {message.session} announces another env/spec than before; is a second publisher there?",
+                )
         except WireError as error:
             self.diagnostics.count("refused_specs", level=diagnostics.ERROR, text=str(error))
             return
+        if known != spec.spec_hash:
+            self._session = 0  # what was read by the spec before is of no use, either
+        self._spec, self._spec_session = spec, message.session
         self._enter_session(message.session)
 
     def _enter_session(self, session: int) -> None:

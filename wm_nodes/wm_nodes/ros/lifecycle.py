@@ -2,6 +2,7 @@
 
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -255,8 +256,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             self.get_logger().info("unconfigured; a lifecycle manager configures and activates this node")
             return True
         done = TransitionCallbackReturn.SUCCESS
-        if self.trigger_configure() != done or self.trigger_activate() != done:
-            self.failed = True
+        self.failed = self.trigger_configure() != done or self.trigger_activate() != done or self.failed
         return not self.failed
 
     def is_settled(self, stop_s: float) -> bool:
@@ -273,6 +273,8 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         label = self._state_machine.current_state[1]
         if label in ("unconfigured", "inactive", "active"):
             self.trigger_shutdown()
+        elif label != "finalized":  # a signal came within a transition
+            self.on_shutdown(LifecycleState(label, 0))
         self._heartbeat.end(RunState.FAILED if self.failed else RunState.FINISHED)
 
     # Lifecycle callbacks of rclpy.
@@ -281,13 +283,15 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self.session = new_session()
         result = self._attempt("configure", self.configure)
         if result == TransitionCallbackReturn.FAILURE:
-            self._let_go()
+            self._let_go(self.cleanup)
+            self._release()
         return result
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self._active = True
         result = self._attempt("activate", self.activate)
         if result != TransitionCallbackReturn.SUCCESS:
+            self._let_go(lambda: self.deactivate("activation failed"))
             self._active = False
             return result
         self.links.announce()
@@ -317,8 +321,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         self._active = False
-        self._attempt("cleanup", self.cleanup)
-        self._release()
+        self.on_cleanup(state)
         return TransitionCallbackReturn.SUCCESS
 
     def _attempt(self, action: str, work: Callable[[], None]) -> TransitionCallbackReturn:
@@ -338,13 +341,12 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self.diagnostics.set_condition("lifecycle", diagnostics.ERROR, f"{action} failed: {text}")
         return result
 
-    def _let_go(self) -> None:
-        """Clean up after a configure() that failed, whose reason stays in diagnostics; a further error is logged."""
+    def _let_go(self, work: Callable[[], None]) -> None:
+        """What follows a failure, whose reason stays in diagnostics; a further error is logged."""
         try:
-            self.cleanup()
+            work()
         except Exception:
-            self.get_logger().error(f"cleanup failed: {traceback.format_exc()}")
-        self._release()
+            self.get_logger().error(f"another error after that: {traceback.format_exc()}")
 
     def _release(self) -> None:
         self._introspected.clear()
@@ -393,8 +395,6 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self.diagnostics.publish()
 
     def _publish_diagnostics(self, message: DiagnosticArray) -> None:
-        try:
+        with suppress(InvalidHandle):
             self._diagnostics_publisher.publish(message)
-        except InvalidHandle:
-            return
 

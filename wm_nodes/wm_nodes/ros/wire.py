@@ -3,18 +3,17 @@
 Shapes: N environments, A action, S state, P ground truth, H W 3 image. Stamps in ns.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wm_nodes.core.errors import RunError
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array, UInt64Array
 
 
 class PeerLost(RunError):
-    """A peer did not answer before the deadline, or was restarted in between."""
+    """A peer did not answer before the deadline, or was restarted, or reset by another client, in between."""
 
 
 class Cancelled(Exception):
@@ -22,7 +21,18 @@ class Cancelled(Exception):
 
 
 @dataclass(frozen=True)
-class StepCommand:
+class _Command:
+    """A request, which may be sent again."""
+
+    def equals(self, other: "_Command | None") -> bool:
+        """Whether the two ask for the same."""
+        return type(self) is type(other) and all(
+            _same(getattr(self, field.name), getattr(other, field.name)) for field in fields(self)
+        )
+
+
+@dataclass(frozen=True)
+class StepCommand(_Command):
     """StepBatch's request."""
 
     session: int
@@ -48,7 +58,7 @@ class StepCommand:
 
 
 @dataclass(frozen=True)
-class ResetCommand:
+class ResetCommand(_Command):
     """ResetBatch's request."""
 
     mask: BoolArray | None = None
@@ -61,11 +71,6 @@ class ResetCommand:
     """Label of the episode events; empty: as before."""
     with_image: bool = True
     """Whether the answer carries the images."""
-
-    def equals(self, other: "ResetCommand") -> bool:
-        """Whether the two ask for the same."""
-        same_arrays = _same(self.mask, other.mask) and _same(self.seeds, other.seeds)
-        return same_arrays and replace(self, mask=None, seeds=None) == replace(other, mask=None, seeds=None)
 
 
 @dataclass(frozen=True)
@@ -94,6 +99,14 @@ class Reply:
     """(N,), as in LockStep."""
     step_s: float = 0.0
     """Inside the environment, s."""
+
+    def check_follows(self, before: "Reply", reset: BoolArray) -> None:
+        """Raise PeerLost where another client has reset the environment since `before`. reset: (N,), by this client."""
+        if (strange := (self.episode_ids != before.episode_ids) & ~reset).any():
+            raise PeerLost(
+                f"another client has reset environments {np.flatnonzero(strange).tolist()} within the episode; let one "
+                "client at a time step an environment, and start again"
+            )
 
 
 @dataclass(frozen=True)
@@ -140,5 +153,7 @@ class EpisodeNote:
     """That chose its newest action."""
 
 
-def _same(array: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
-    return array is other if array is None or other is None else np.array_equal(array, other)
+def _same(value: Any, other: Any) -> bool:
+    if isinstance(value, np.ndarray) and isinstance(other, np.ndarray):
+        return np.array_equal(value, other, equal_nan=True)
+    return type(value) is type(other) and bool(value == other)

@@ -17,6 +17,7 @@ from wm_nodes.core.lockstep import Goals, LockStep
 from wm_nodes.core.types import FloatArray, Observation, StepResult, UInt8Array
 from wm_nodes.nodes.environment.asynchronous import AsynchronousEnvironment
 from wm_nodes.nodes.environment.lockstep import LockstepEnvironment
+from wm_nodes.nodes.environment.remote_environment import RemoteEnvironment
 from wm_nodes.nodes.environment.stamp_clock import StampClock
 from wm_nodes.ros.clients import LocalEnvironmentClient
 from wm_nodes.ros.wire import EpisodeNote, PeerLost, ResetCommand, StepCommand
@@ -229,3 +230,76 @@ def test_a_reset_that_was_sent_again_while_it_was_made_is_made_once(monkeypatch:
         between()
         bench.served.reset(again)
         assert len(made) == count + 1
+
+
+def remote(bench: Bench) -> RemoteEnvironment:
+    return RemoteEnvironment(LocalEnvironmentClient(lambda: bench.served), lambda: None, timeout_s=1.0)
+
+
+def test_a_step_is_answered_again_only_to_the_client_that_asked_for_it() -> None:
+    bench = Bench()
+    command = replace(bench.command(), values=np.full(N, np.nan, np.float32))
+    reply = bench.served.step(command)
+    assert bench.served.step(replace(command, values=np.full(N, np.nan, np.float32))) is reply
+    for changes in ({"actions": np.full(N * 3, 0.5, np.float32)}, {"policy_version": 3}, {"values": None}):
+        with pytest.raises(WireError, match=r"nor the last step, sent again; is there a second client\?") as refused:
+            bench.served.step(replace(command, **changes))
+        assert refused.value.code == ErrorCode.OUT_OF_ORDER
+    assert len(bench.transitions) == 2
+
+
+def test_of_two_clients_of_one_environment_neither_goes_on_with_the_other_s_episodes() -> None:
+    bench = Bench()
+    first, second = remote(bench), remote(bench)
+    first.reset()
+    first.step(np.zeros((N, 3), np.float32))
+    second.reset()
+    with pytest.raises(PeerLost, match=r"another client has reset environments \[0, 1\] within the episode"):
+        first.step(np.zeros((N, 3), np.float32))
+    with pytest.raises(WireError, match="is there a second client"):
+        second.step(np.full((N, 3), 0.5, np.float32))
+    first.reset(seeds=np.arange(N, dtype=np.uint64))
+    for client, mine, other in ((second, 0, 1), (first, 1, 0)):
+        with pytest.raises(PeerLost, match=rf"environments \[{other}\]"):
+            client.reset(np.arange(N) == mine)
+
+
+def test_an_environment_that_one_client_resets_in_part_is_stepped_on() -> None:
+    bench = Bench()
+    client = remote(bench)
+    client.reset()
+    client.step(np.zeros((N, 3), np.float32))
+    before = client.reset(np.array([False, True])).episode_id
+    after = client.step(np.zeros((N, 3), np.float32)).observation.episode_id
+    assert (before == after).all()
+
+
+def test_a_robot_is_left_from_its_last_step_within_an_episode_until_it_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench, now_s = Bench(), 10.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+
+    def left_for_s() -> float:
+        nonlocal now_s
+        now_s += 2.0
+        return bench.served.left_for_s
+
+    assert left_for_s() == 0.0, "what was only reset stays put"
+    bench.served.step(bench.command())
+    assert (left_for_s(), left_for_s()) == (2.0, 4.0)
+    bench.served.reset(ResetCommand())
+    assert left_for_s() == 2.0, "a reset need not end what a step began"
+    bench.served.hold_now()
+    assert left_for_s() == 0.0
+    while bench.served._episodes.running.any():
+        bench.served.step(bench.command())
+    assert left_for_s() == 0.0, "at the end of its episode a robot holds by itself"
+    bench.environment.error = OSError("no answer")
+    with pytest.raises(WireError, match="no answer"):
+        bench.served.step(bench.command())
+    assert left_for_s() == 2.0, "whatever a failed step began"
+    bench.served.hold_now()
+    bench.served.reset(ResetCommand())
+    assert left_for_s() == 0.0
+    bench.served.end_episodes(EpisodeEvent.REASON_ESTOP)
+    bench.served.step(bench.command())
+    assert left_for_s() == 2.0, "an episode that was ended from outside is no rest"

@@ -105,8 +105,10 @@ class LockstepEnvironment:
         self._seed, self._draws = seed, 0
         self._lock = threading.Lock()
         self._clock = clock or StampClock()
-        self._stamp_ns = 0
-        self._last_step_id = 0
+        self._stamp_ns = self._last_step_id = 0
+        self._told_s: float | None = None
+        """When it was told something with which a robot may go on, on the time.monotonic clock; None: it stays put."""
+        self._last_command: StepCommand | None = None
         self._last_reply: Reply | WireError | None = None
         self._last_reset: _Reset | None = None
         self._current: Observation | None = None
@@ -139,9 +141,10 @@ class LockstepEnvironment:
             seeds = self._seeds(command.seeds)
             self._episodes.end(mask, EpisodeEvent.REASON_RESET, self._stamp_ns)
             self._episodes.behaviour = command.behaviour or self._episodes.behaviour
+            told_s, self._told_s = self._told_s, time.monotonic()
             with self._environment_errors():
                 self._current = self.environment.reset(mask, seeds)
-            self._stamp_ns = self._clock()
+            self._stamp_ns, self._told_s = self._clock(), told_s and time.monotonic()
             reply = self._reply(command.with_image)
             self._last_reply = None
             self._publish_observation(goals_changed=True)
@@ -152,7 +155,7 @@ class LockstepEnvironment:
             return reply
 
     def step(self, command: StepCommand) -> Reply:
-        """Step once; the same step_id again returns the stored answer.
+        """Step once; the same command again returns the stored answer.
 
         Raises:
             WireError: SPEC_MISMATCH, OUT_OF_ORDER, BAD_SHAPE, NAN_INPUT, OUT_OF_RANGE, ESTOP, NAN_MODEL, INTERNAL, or
@@ -161,15 +164,19 @@ class LockstepEnvironment:
         """
         with self._lock:
             self._check_client(command)
-            if self._last_reply is None or command.step_id != self._last_step_id:
+            if self._last_reply is None or not command.equals(self._last_command):
                 plan, started = self._plan(command), time.perf_counter()
-                self._last_reset = None
-                result = self._advance(plan)
+                self._last_reset, self._told_s = None, time.monotonic()
+                with self._environment_errors():
+                    result = self.environment.step(plan.actions)
                 valid, broken = self._judge_ends(plan, result)
                 self._reset_some(plan, result.observation)
                 step = self._lockstep(plan, result, valid)
                 reply = self._answer(plan, step, time.perf_counter() - started)
                 self._publish(plan, step)
+                self._last_command = command
+                goes_on = result.valid & ~result.terminated & ~result.truncated
+                self._told_s = time.monotonic() if goes_on.any() else None
                 self._last_reply = _nan_error(broken, command.step_id) if broken.any() else reply
             if isinstance(self._last_reply, WireError):
                 raise self._last_reply
@@ -179,6 +186,12 @@ class LockstepEnvironment:
     def is_robot(self) -> bool:
         """Whether it may go on with its last action between two steps; what is computed stands still."""
         return self.spec.source == SOURCE_REAL
+
+    @property
+    def left_for_s(self) -> float:
+        """Time since it was told something with which a robot may go on; 0 while it works, and where it stays put."""
+        told_s = self._told_s
+        return 0.0 if told_s is None or self._lock.locked() else time.monotonic() - told_s
 
     def hold_now(self) -> BoolArray:
         """Have a robot hold, which without further steps might go on with its last action, outside of any step: by its
@@ -191,14 +204,14 @@ class LockstepEnvironment:
             WireError: INTERNAL, NAN_MODEL: the environment failed.
         """
         with self._lock, self._environment_errors():
-            if self._current is None or self.spec.source == SOURCE_IMAGINED:
-                return np.zeros(self.spec.num_envs, bool)
-            if self.is_robot and (hold := getattr(self.environment, "hold", None)):
+            is_untouched, self._told_s = self._current is None and self._told_s is None, None
+            if self.is_robot and not is_untouched and (hold := getattr(self.environment, "hold", None)):
                 hold()
-                return np.zeros(self.spec.num_envs, bool)
-            result = self.environment.step(self.hold_actions())
-            self._episodes.count_hold()
-            return result.terminated | result.truncated
+            elif self._current is not None and self.spec.source != SOURCE_IMAGINED:
+                result = self.environment.step(self.hold_actions())
+                self._episodes.count_hold()
+                return result.terminated | result.truncated
+            return np.zeros(self.spec.num_envs, bool)
 
     def hold_actions(self) -> FloatArray:
         """Actions (N, A) that leave every tool where it is commanded to be; zeros before the first reset."""
@@ -238,8 +251,8 @@ class LockstepEnvironment:
         if command.step_id != self.next_step_id:
             raise WireError(
                 ErrorCode.OUT_OF_ORDER,
-                f"step_id {command.step_id} is neither the last one ({self._last_step_id}) nor the next one "
-                f"({self.next_step_id}); continue with {self.next_step_id}",
+                f"step_id {command.step_id} is neither the next one ({self.next_step_id}) nor the last step, sent "
+                f"again; is there a second client? continue with {self.next_step_id}",
             )
         if self._current is None:
             raise WireError(ErrorCode.OUT_OF_ORDER, "never reset; call env/reset first")
@@ -249,13 +262,10 @@ class LockstepEnvironment:
         self._gate()
         return _Plan(command, actions, resets, seeds, self._current, self._stamp_ns)
 
-    def _advance(self, plan: _Plan) -> StepResult:
-        with self._environment_errors():
-            return self.environment.step(plan.actions)
-
     def _judge_ends(self, plan: _Plan, result: StepResult) -> tuple[BoolArray, BoolArray]:
         """End the episodes of which the model predicted NaN; return which environments stepped, and which broke."""
-        broken = self._episodes.running & ~_finite(result) & ~plan.resets
+        finite = np.isfinite(result.observation.state).all(1) & np.isfinite(result.success_probability)
+        broken = self._episodes.running & ~finite & ~plan.resets
         self._episodes.end(broken, EpisodeEvent.REASON_ERROR, plan.stamp_ns, abort=True)
         return result.valid & self._episodes.running & ~plan.resets, broken
 
@@ -344,9 +354,7 @@ class LockstepEnvironment:
 
     def _reply(self, with_image: bool) -> Reply:
         assert self._current is not None
-        count = self.spec.num_envs
-        none = np.zeros(count, bool)
-        zeros = np.zeros(count, np.float32)
+        none, zeros = np.zeros(self.spec.num_envs, bool), np.zeros(self.spec.num_envs, np.float32)
         return Reply(
             session=self.session, step_id=self._last_step_id, stamp_ns=self._stamp_ns,
             images=self._current.image if with_image else None, states=self._current.state, terminated=none,
@@ -380,12 +388,6 @@ class LockstepEnvironment:
                 goals = self.environment.goals()
             images, known = (None, np.zeros(self.spec.num_envs, bool)) if goals is None else goals
             self._sink.goals(Goals(self._stamp_ns, images, known, self._current.episode_id, self.session))
-
-
-def _finite(result: StepResult) -> BoolArray:
-    """(N,): state and success probability are numbers."""
-    finite: BoolArray = np.isfinite(result.observation.state).all(1) & np.isfinite(result.success_probability)
-    return finite
 
 
 def _nan_error(broken: BoolArray, step_id: int) -> WireError:

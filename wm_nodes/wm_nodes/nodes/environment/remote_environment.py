@@ -20,7 +20,8 @@ class RemoteEnvironment:
         policy_version: carried by the transitions.
 
     Raises:
-        PeerLost, WireError: from the constructor, reset and step; see ros.clients.
+        PeerLost, WireError: from the constructor, reset and step; see ros.clients. PeerLost, too, where another client
+            has reset the environment since the last call.
     """
 
     def __init__(
@@ -34,8 +35,10 @@ class RemoteEnvironment:
         self._last: Reply | None = None
 
     def reset(self, mask: BoolArray | None = None, seeds: UInt64Array | None = None) -> Observation:
-        self._last = self._client.reset(ResetCommand(mask, seeds, behaviour=self._behaviour), self._check)
+        reply = self._client.reset(ResetCommand(mask, seeds, behaviour=self._behaviour), self._check)
         reset = np.ones(self.spec.num_envs, bool) if mask is None else mask
+        reply.check_follows(self._last or reply, reset)
+        self._last = reply
         self._steps = np.where(reset, 0, self._steps).astype(np.uint32)
         self._ended = self._ended & ~reset
         return self._observation(self._last)
@@ -51,6 +54,7 @@ class RemoteEnvironment:
             ),
             self._check,
         )
+        reply.check_follows(self._last, np.zeros_like(self._ended))
         valid = ~self._ended
         self._steps = self._steps + valid.astype(np.uint32)
         self._ended = self._ended | reply.terminated | reply.truncated
