@@ -47,7 +47,7 @@ class EndogenousReward:
     @property
     def version(self) -> int:
         differences = self._config.dense_weight > 0 and self._config.mode != "abs"
-        clipped = ["clipped above"] if differences else []  # until 2026-11-30 below, too
+        clipped = ["clipped above"] if differences else []  # the rule of what is paid
         return version_of(self.name, self._config.model_dump_json(), self._distance.name, *clipped)
 
     @property
