@@ -123,7 +123,7 @@ def test_each_file_of_a_split_bag_is_a_complete_indexed_mcap(tmp_path: Path) -> 
             assert reader.get_header().profile == "ros2"
             assert {chunk.compression for chunk in summary.chunk_indexes} == {"zstd"}
             names = [metadata.name for metadata in reader.iter_metadata()]
-            assert names == ["wm.start", "rosbag2"]
+            assert names == ["wm.start", "wm.episode", "rosbag2"]
             for channel in summary.channels.values():
                 assert set(channel.metadata) == {"offered_qos_profiles", "topic_type_hash"}
 
