@@ -210,7 +210,7 @@ def test_cancel_is_answered_at_once_while_the_video_model_hangs_and_leaves_no_go
         model.send_signal(signal.SIGSTOP)
         try:
             handle = loop.send(1)
-            time.sleep(within(0.5))  # the learner has asked for clips by now
+            time.sleep(min(within(0.5), 1.5))  # the learner has asked for clips by now, and does not miss the model yet
             began = time.monotonic()
             result = loop.cancel(handle)
             assert time.monotonic() - began < within(ANSWER_S)

@@ -18,7 +18,7 @@ from wm_nodes.nodes.learner.rollout_assembler import RolloutAssembler
 from wm_nodes.recording.join import KEPT, Joiner
 from wm_nodes.ros.flow_control import SILENT_S, ConsumerCredits, ProducerCredits
 from wm_nodes.ros.liveliness import PeerWatch
-from wm_nodes.ros.sequence_numbers import GapTracker
+from wm_nodes.ros.sequence_numbers import BACK_RUN, GapTracker
 
 N = 2
 
@@ -151,6 +151,16 @@ def test_a_withheld_grant_is_repeated_but_does_not_grow_until_it_is_given_again(
     assert node.sent[-1].granted_seq == 11
 
 
+def test_stray_old_messages_take_back_no_grant() -> None:
+    node = GrantingNode()
+    grantor, tracker = ConsumerCredits(node, "env/transition"), GapTracker()  # type: ignore[arg-type]
+    stray = (*range(BACK_RUN - 1), 40, 41, *range(BACK_RUN - 1), 100, BACK_RUN - 1, 101, BACK_RUN, 102)
+    for seq in (*range(100), *stray):
+        tracker.observe(1, seq)
+        grantor.record_consumed(tracker)
+    assert tracker.last_seq == 102 and node.sent[-1].granted_seq > 99
+
+
 @pytest.mark.parametrize("goes_on_at", [0, 30])
 def test_a_replay_that_begins_again_is_held_where_the_first_one_was(goes_on_at: int) -> None:
     node = GrantingNode()
@@ -171,12 +181,12 @@ def test_a_replay_that_begins_again_is_held_where_the_first_one_was(goes_on_at: 
 
 def test_a_replay_that_begins_again_while_credit_is_withheld_is_held_after_one_window() -> None:
     node = GrantingNode()
-    grantor, tracker = ConsumerCredits(node, "env/transition", window=8), GapTracker()  # type: ignore[arg-type]
-    for seq in (*range(50), *range(8)):
+    grantor, tracker = ConsumerCredits(node, "env/transition"), GapTracker()  # type: ignore[arg-type]
+    for seq in (*range(50), *range(12)):
         grantor.withhold(seq == 49 or grantor.withheld)
         tracker.observe(1, seq)
         grantor.record_consumed(tracker)
-    assert node.sent[-1].granted_seq < 16 and tracker.lost == 0
+    assert node.sent[-1].granted_seq < 30 and tracker.lost == 0
 
 
 def test_a_silent_peer_is_lost_once_and_a_leaving_one_is_not() -> None:

@@ -12,6 +12,8 @@ MAX_NUMBER = 2**64 - 1
 MAX_GAP = 2**16
 """One message that jumps by more is no number at all: no history and no credit window is as long, and a restart of the
 sender begins another session."""
+BACK_RUN = 8
+"""Messages one after the other, lower than before, by which a player shows that it went back."""
 
 SESSIONS_KEPT = 64
 
@@ -50,7 +52,8 @@ class GapTracker:
     session: int | None = None
     """Of the newest message; None before any."""
     last_seq: int = -1
-    """Of that session; of a message that went back or jumped only when the next one goes on from there."""
+    """Of that session; a jump is believed when the next message goes on from there, a way back after BACK_RUN ones: it
+    takes back what was granted, and a stray old message must not hold a producer up."""
     received: int = 0
     """Messages of all sessions."""
     lost: int = 0
@@ -62,7 +65,9 @@ class GapTracker:
     _last_seqs: dict[int, int] = field(default_factory=dict, repr=False)
     """Newest number of each session."""
     _jumped_to: tuple[int, int] | None = field(default=None, repr=False)
-    """Where the newest jump, or way back, went."""
+    """The newest message of a jump or a way back."""
+    _run: int = field(default=0, repr=False)
+    """How many came one after the other up to that one."""
 
     def observe(self, session: int, seq: int) -> int:
         """Note one message; return how many of its session were missed directly before it."""
@@ -78,9 +83,11 @@ class GapTracker:
         if not 0 <= missing <= MAX_GAP:
             self.jumps += missing > 0
             goes_on, self._jumped_to = self._jumped_to == (session, seq - 1), (session, seq)
-            if not goes_on:
+            self._run = self._run + 1 if goes_on else 1
+            if self._run < (2 if missing > 0 else BACK_RUN):
                 return 0
             missing = 0
+        self._jumped_to = None
         if missing:
             self.lost += missing
             self.gaps.append((session, self.last_seq + 1, missing))
