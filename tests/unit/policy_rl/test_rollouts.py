@@ -10,7 +10,7 @@ from rl_toys import NUM_ENVS, STEPS, toy_policy, toy_rollout
 from wm_nodes.config.load import load_config
 from wm_nodes.config.seed_ranges import EVALUATION
 from wm_nodes.core.types import Rollout
-from wm_nodes.policy_rl.rollouts import action_noise, collect_rollout, reset_seeds, rollout_statistics
+from wm_nodes.policy_rl.rollouts import Convergence, action_noise, collect_rollout, reset_seeds, rollout_statistics
 from wm_nodes.reward import RewardInput, RewardResult, RuleReward
 
 
@@ -112,6 +112,16 @@ def test_statistics_are_of_first_episodes_and_later_short_ones_do_not_count() ->
     assert found.success_rate == pytest.approx(1 / 3), "environment 2 did not succeed in the time there was"
     assert found.mean_return == pytest.approx((3 + 1.5) / 2)
     assert found.mean_length == pytest.approx((2 + 3) / 2)
+
+
+def test_training_has_converged_after_enough_updates_in_a_row_without_a_failure() -> None:
+    base = toy_rollout(toy_policy(), steps=2)
+    ends = np.array([[False] * NUM_ENVS, [True] * NUM_ENVS])
+    won = replace(base, terminated_TN=ends, truncated_TN=~ends & False, valid_TN=np.ones_like(ends))
+    lost = replace(won, terminated_TN=ends & (np.arange(NUM_ENVS) > 0), truncated_TN=ends & (np.arange(NUM_ENVS) == 0))
+    convergence = Convergence(2)
+    assert [convergence.reached(rollout) for rollout in (won, lost, won, won)] == [False, False, False, True]
+    assert not any(Convergence(0).reached(won) for _ in range(3)), "0 is never"
 
 
 def test_statistics_without_an_ended_episode_are_missing_not_zero() -> None:

@@ -314,6 +314,8 @@ class PpoConfig(SettingsSection):
     min_log_std: float = -20.0
     """Floor of the policy's log standard deviation, normalised action units: a policy that stops exploring has ratios
     without bound."""
+    converged_updates: NonNegativeInt = 0
+    """Training ends as converged after so many updates in a row in whose rollouts no episode failed; 0: never."""
     value_warmup_updates: NonNegativeInt
     """gae: first updates that train the critic only."""
 

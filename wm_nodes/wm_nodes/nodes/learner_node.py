@@ -169,6 +169,10 @@ class LearnerNode(TrainingNode):
                     return
                 self._count_dropped(following[1])
                 self._update(work, goal, update, *following)
+                if 0 < self._config.ppo.converged_updates <= self._training.progress.unfailed:
+                    result.termination_reason = Train.Result.LIMIT
+                    result.message = f"converged: {self._training.progress.unfailed} updates without a failed episode"
+                    return
             self._meter.check(work.check)
 
     def _next(

@@ -132,6 +132,25 @@ class RolloutStatistics:
         """Share of the first episodes that succeeded inside the rollout; those cut short did not."""
         return self.successes / self.begun if self.episodes else float("nan")
 
+    def unfailed_after(self, unfailed: int) -> int:
+        """Updates in a row without a failed episode, this rollout's included, `unfailed` of them before it."""
+        return unfailed + 1 if self.success_rate == 1.0 else 0
+
+
+@dataclass
+class Convergence:
+    """Says when training has converged (ppo.converged_updates)."""
+
+    wanted: int
+    """Updates in a row in whose rollouts no episode fails; 0: never."""
+    unfailed: int = 0
+    """Those up to the newest update."""
+
+    def reached(self, rollout: Rollout | TensorRollout) -> bool:
+        """Count the rollout of one more update; return whether training has converged."""
+        self.unfailed = rollout_statistics(rollout).unfailed_after(self.unfailed)
+        return 0 < self.wanted <= self.unfailed
+
 
 def reset_seeds(
     seed: int, policy_version: int, step: int, num_envs: int, envs_per_start: int = 1

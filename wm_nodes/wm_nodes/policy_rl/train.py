@@ -14,7 +14,7 @@ from wm_nodes.core.types import Environment, Rollout
 from wm_nodes.policy_rl import factories
 from wm_nodes.policy_rl.device_rollout import make_collector
 from wm_nodes.policy_rl.image_policy import ImagePolicy
-from wm_nodes.policy_rl.rollouts import TensorRollout, rollout_statistics
+from wm_nodes.policy_rl.rollouts import Convergence, TensorRollout, rollout_statistics
 from wm_nodes.policy_rl.validation import acceptance, exploit_meter
 from wm_nodes.reward import RewardModel
 from wm_nodes.world_model import DeviceEnvironment
@@ -24,14 +24,16 @@ def train_policy(
     policy: ImagePolicy, env: Environment | DeviceEnvironment, reward: RewardModel, config: RunConfig,
     meter: exploit_meter.ExploitMeter | None = None,
 ) -> Iterator[tuple[Rollout | TensorRollout, Any]]:
-    """Train `policy` in place for ppo.updates updates, or until `meter` stops it; yield each update."""
+    """Train `policy` in place for ppo.updates updates, or until `meter` stops it or it converged; yield each update."""
     learner = factories.make_learner(policy, config)  # PPO, unless learner.factory names another
     collect = make_collector(env, policy, reward, config.ppo.envs_per_start)  # act, step, reward
     num_steps = config.ppo.num_steps * config.ppo.num_envs // env.spec.num_envs  # however many step at a time
-    versions = range(1, config.ppo.updates + 1)
+    versions, convergence = range(1, config.ppo.updates + 1), Convergence(config.ppo.converged_updates)
     for version in versions if meter is None else meter.watch(policy, versions):
         rollout = collect(num_steps, config.seed, version)
         yield rollout, learner.update(rollout)  # the policy is version + 1 from here on
+        if convergence.reached(rollout):
+            return
 
 
 def main(words: list[str] | None = None) -> None:

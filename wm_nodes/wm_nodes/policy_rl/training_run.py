@@ -54,6 +54,8 @@ class Progress:
     """Of the newest rollout, see RolloutStatistics."""
     success_rate: float = math.nan
     """Of the newest rollout, see RolloutStatistics."""
+    unfailed: int = 0
+    """Updates in a row, up to the newest, in whose rollouts no episode failed."""
 
 
 class PolicyTraining(TrainingRun):
@@ -128,6 +130,7 @@ class PolicyTraining(TrainingRun):
         progress.dropped_gap += dropped.gap
         progress.dropped_stale += dropped.stale
         progress.mean_return, progress.success_rate = statistics.mean_return, statistics.success_rate
+        progress.unfailed = statistics.unfailed_after(progress.unfailed)
         self.save()
         seconds = time.perf_counter() - began
         counts = {"episodes": float(statistics.episodes), "cut_episodes": float(statistics.cut)}
