@@ -16,8 +16,12 @@ from wm_nodes.config.load import ConfigError, load_config
 from wm_nodes.core.types import Environment
 from wm_nodes.environments.batch import EnvironmentBatch
 from wm_nodes.environments.registry import configured_spec, make_environment
+from wm_nodes.policy_rl.advantages import gae
 from wm_nodes.policy_rl.factories import untrained_policy
+from wm_nodes.policy_rl.image_policy import PolicyOutput
+from wm_nodes.policy_rl.rollouts import collect_rollout, rollout_statistics
 from wm_nodes.policy_rl.validation.evaluation import evaluate
+from wm_nodes.reward.rule import RuleReward
 
 
 class Seesaw(gymnasium.Env[dict[str, Any], np.ndarray]):
@@ -73,12 +77,37 @@ def test_actions_are_scaled_to_its_box_and_pictures_to_the_size() -> None:
     np.testing.assert_allclose(result.observation.state, [[1, 0.5, -0.5], [0, 0.5, -0.5]])
 
 
-def test_success_is_what_info_says_and_a_fall_truncates() -> None:
-    environment = made(SEESAW)
+def test_success_is_what_info_says_and_a_fall_has_failed_for_good() -> None:
+    environment = made(SEESAW, num_envs=3)
     environment.reset()
-    result = environment.step(np.array([[0, 0.9], [0, -0.9]], np.float32))
-    assert result.terminated.tolist() == [True, False] and result.truncated.tolist() == [False, True]
-    assert result.success_probability.tolist() == [1.0, 0.0]
+    result = environment.step(np.array([[0, 0.9], [0, -0.9], [0, 0]], np.float32))
+    assert result.success.tolist() == [True, False, False] and result.ended.tolist() == [True, True, False]
+    assert result.terminated.tolist() == [True, True, False] and result.truncated.tolist() == [False, True, False]
+    assert result.success_probability.tolist() == [1.0, 0.0, 0.0]
+
+
+class Falling:
+    """A policy of one action: the seesaw falls, in its first step."""
+
+    def act(self, images: Any, states: Any, noise: Any = None) -> PolicyOutput:
+        actions = np.tile(np.float32([0, -0.9]), (len(states), 1))
+        return PolicyOutput(actions, np.zeros(len(states), np.float32), np.full(len(states), 0.7, np.float32))
+
+
+def test_no_success_is_counted_after_a_fall_and_no_value_follows_it() -> None:
+    environment, policy = made(SEESAW), Falling()
+    played = evaluate(policy, environment, 3, 1, deterministic=True)  # type: ignore[arg-type]
+    assert not played.success.any() and played.length.tolist() == [1, 1, 1]
+    rollout = collect_rollout(environment, policy, RuleReward(), 2, 0, 1, 1)  # type: ignore[arg-type]
+    told = rollout_statistics(rollout)
+    assert (told.episodes, told.successes) == (2, 0)
+    columns = (torch.from_numpy(c[:1]) for c in (
+        rollout.rewards_TN, rollout.values_TN, rollout.values_TN, rollout.terminated_TN, rollout.truncated_TN,
+        rollout.valid_TN,
+    ))
+    advantages, returns = gae(*columns, gamma=0.9, lambda_=0.9)
+    np.testing.assert_allclose(advantages, [[-0.7, -0.7]])  # where an episode cut by time has -0.7 + 0.9 * 0.7
+    np.testing.assert_allclose(returns, [[0, 0]], atol=1e-7)
 
 
 def test_numbers_of_info_are_its_ground_truth_and_an_evaluation_gives_the_largest_of_each_episode() -> None:

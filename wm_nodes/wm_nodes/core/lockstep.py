@@ -91,9 +91,9 @@ class LockStep:
     values: FloatArray
     """(N,), the critic's, of the observation; NaN where unknown."""
     terminated: BoolArray
-    """(N,), the task is over."""
+    """(N,), the task is over: done, or failed for good where truncated is set, too."""
     truncated: BoolArray
-    """(N,), cut by the step limit or by the model's uncertainty."""
+    """(N,), ended without success: by the step limit, the model's uncertainty, or a failure."""
     valid: BoolArray
     """(N,), False where the environment was reset instead of stepped, or is waiting for a reset."""
     episode_ids: UInt64Array
@@ -129,8 +129,13 @@ class LockStep:
         return self.stamp_ns == self.next_stamp_ns
 
     @property
+    def success(self) -> BoolArray:
+        """(N,), the task is done."""
+        return self.terminated & ~self.truncated
+
+    @property
     def ended(self) -> BoolArray:
-        """(N,), the episode is over, for either reason."""
+        """(N,), the episode is over, for whichever reason."""
         return self.terminated | self.truncated
 
 

@@ -41,9 +41,9 @@ class StepResult:
     observation: Observation
     """What the environments show after it."""
     terminated: BoolArray
-    """bool (N,), the task is over."""
+    """bool (N,), the task is over: done, or failed for good where truncated is set, too."""
     truncated: BoolArray
-    """bool (N,), cut by the step limit; never together with terminated."""
+    """bool (N,), ended without success."""
     success_probability: FloatArray
     """float32 (N,), the model's done signal on the next observation; 0 or 1 in a simulator."""
     uncertainty: FloatArray
@@ -52,6 +52,16 @@ class StepResult:
     """float32 (N, P) after the step; NaN where nobody knows (imagined)."""
     valid: BoolArray
     """bool (N,), False where the environment was reset instead of stepped, or is waiting for a reset."""
+
+    @property
+    def success(self) -> BoolArray:
+        """bool (N,), the task is done."""
+        return self.terminated & ~self.truncated
+
+    @property
+    def ended(self) -> BoolArray:
+        """bool (N,), the episode is over, for whichever reason."""
+        return self.terminated | self.truncated
 
 
 class Environment(Protocol):
@@ -108,9 +118,9 @@ class Episode:
     rewards: FloatArray
     """float32 (T,), NaN where missing."""
     terminated: bool
-    """Flag of the last step: the task is over."""
+    """Flag of the last step: the task is over, as in StepResult."""
     truncated: bool
-    """Flag of the last step: cut by the step limit."""
+    """Flag of the last step: ended without success."""
     task: str
     """Name of the task."""
     instruction: str

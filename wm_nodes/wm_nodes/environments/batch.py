@@ -23,7 +23,9 @@ class Frame(NamedTuple):
     success: bool = False
     """Whether the task is done, which terminates the episode."""
     over: bool = False
-    """Whether the episode cannot go on without success: it counts as truncated."""
+    """Whether the episode is cut without success, as by a time limit: what would follow still counts in training."""
+    failed: bool = False
+    """Whether the task has failed for good, as after a fall: nothing that could follow is worth anything."""
     truth: Sequence[float] = ()
     """The spec's ground truth; NaN for what is unknown."""
 
@@ -77,19 +79,20 @@ class EnvironmentBatch:
 
     def step(self, actions: FloatArray) -> StepResult:
         check_actions(actions, self.spec)
-        valid, success, over = ~self._ended, np.zeros_like(self._ended), np.zeros_like(self._ended)
+        valid, (success, over, failed) = ~self._ended, np.zeros((3, len(self._copies)), bool)
         for env in np.flatnonzero(valid):
             frame = self._copies[env].step(actions[env])
             self._show(env, frame)
-            success[env], over[env] = frame.success, frame.over
+            success[env], over[env], failed[env] = frame.success, frame.over, frame.failed
         self._steps += valid.astype(np.uint32)
-        truncated = valid & ~success & (over | (self._steps >= self.spec.max_episode_steps))
+        failed &= ~success
+        truncated = valid & ~success & (over | failed | (self._steps >= self.spec.max_episode_steps))
         self._ended = self._ended | success | truncated
         if self.spec.source == SOURCE_REAL:
             self._hold(np.flatnonzero(success | truncated))
         count = len(self._copies)
         return StepResult(
-            self._observation(), success, truncated, success.astype(np.float32), np.zeros(count, np.float32),
+            self._observation(), success | failed, truncated, success.astype(np.float32), np.zeros(count, np.float32),
             self.ground_truth.copy(), valid,
         )
 

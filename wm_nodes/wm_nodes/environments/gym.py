@@ -52,9 +52,9 @@ class TaskEnv(gymnasium.Env[dict[str, Any], FloatArray]):
 
     def step(self, action: FloatArray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         result = self._env.step(np.asarray(action, np.float32)[None])
-        success = bool(result.terminated[0])
+        success = bool(result.success[0])
         info = self._info(success)
-        return _shown(result.observation), float(success), success, bool(result.truncated[0]), info
+        return _shown(result.observation), float(success), bool(result.terminated[0]), bool(result.truncated[0]), info
 
     def render(self) -> UInt8Array | None:
         return self._env.current().image[0] if self.render_mode == "rgb_array" else None

@@ -27,8 +27,7 @@ def gymnasium_environment(config: GymnasiumConfig, num_envs: int, seed: int) -> 
 class GymnasiumCopy:
     """One of the copies: pictures of gymnasium.image_size, actions of [-1, 1] over its Box, measured states.
 
-    An end that the environment calls terminated, but not a success, truncates the episode: terminated means success
-    here.
+    An end that the environment calls terminated, but not a success, has failed for good.
     """
 
     def __init__(self, config: GymnasiumConfig, cameras: MujocoCameras) -> None:
@@ -74,20 +73,20 @@ class GymnasiumCopy:
         success = bool(info.get(self._config.success)) if self._config.success else bool(terminated)
         if absent := [name for name in self._config.measures if name not in info]:
             raise ValueError(f"gymnasium.measures names {absent}, and info has {sorted(info)}")
-        return self._frame(observed, info, success, bool(terminated or truncated))
+        return self._frame(observed, info, success=success, over=bool(truncated), failed=bool(terminated))
 
     def close(self) -> None:
         self._cameras.close()
         self._env.close()
 
-    def _frame(self, observed: Any, info: Mapping[str, Any], success: bool = False, over: bool = False) -> Frame:
+    def _frame(self, observed: Any, info: Mapping[str, Any], **ends: bool) -> Frame:
         pixels = self._config.pixels
         if pixels == CAMERAS:
             image = self._cameras(self._env.unwrapped)
         else:
             image = self._resized(np.asarray(self._env.render() if pixels == RENDER else _part(observed, pixels)))
         truth = [float(info.get(name, np.nan)) for name in self._config.measures]
-        return Frame(image, np.array([*self._state(observed).values()], np.float32), success, over, truth)
+        return Frame(image, np.array([*self._state(observed).values()], np.float32), truth=truth, **ends)
 
     def _resized(self, image: UInt8Array) -> UInt8Array:
         pixels = self._config.pixels

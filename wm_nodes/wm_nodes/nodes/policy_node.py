@@ -140,7 +140,7 @@ class PolicyNode(ManagedNode):
         reply = self._first_observation(goal, spec, version, work)
         result.policy_version, result.env_session = version, reply.session
         result.first_step_id = reply.step_id + 1
-        ended = reply.terminated | reply.truncated
+        ended = reply.ended
         started = reported = time.monotonic()
         for step in range(goal.steps):
             work.check()
@@ -171,10 +171,10 @@ class PolicyNode(ManagedNode):
             self.diagnostics.latency("infer", infer_s)
             self.diagnostics.latency("step", time.perf_counter() - began)
             self._last_reply = reply
-            ended = reply.terminated | reply.truncated
+            ended = reply.ended
             result.last_step_id = step_id
             result.episodes += int(ended.sum())
-            result.successes += int(reply.terminated.sum())
+            result.successes += int((reply.terminated & ~reply.truncated).sum())
             now = time.monotonic()
             result.steps_per_s = (step + 1) * spec.num_envs / max(now - started, 1e-9)
             if now - reported > FEEDBACK_S:

@@ -183,7 +183,7 @@ class ImaginedVectorEnv(VectorEnv[dict[str, Any], FloatArray, NDArray[Any]]):
         if not paid.valid.all():
             raise ValueError(f"reward {self._reward.name} has none for a step: {paid.invalid_reason}; Gymnasium knows "
                              "no step without a reward, choose another in reward.*")
-        ended = self._waiting = result.terminated | result.truncated
+        ended = self._waiting = result.ended
         values = {"is_success": result.terminated, "success_probability": result.success_probability,
                   "uncertainty": result.uncertainty}
         infos = _of(values, ~ended)

@@ -48,9 +48,9 @@ class TensorRollout:
     rewards_TN: Tensor
     """float32 (T, N), NaN where there is none."""
     terminated_TN: Tensor
-    """bool (T, N), the task is over."""
+    """bool (T, N), as in StepResult."""
     truncated_TN: Tensor
-    """bool (T, N), cut by time or disagreement."""
+    """bool (T, N), as in StepResult."""
     valid_TN: Tensor
     """bool (T, N), a step was made and has a reward."""
     policy_version: int
@@ -117,7 +117,7 @@ class RolloutStatistics:
     episodes: int
     """First episodes that ended inside the rollout."""
     successes: int
-    """Of these, those that terminated (the environment's own done signal)."""
+    """Of these, those that are done (the environment's own signal)."""
     mean_return: float
     """Of the ended ones."""
     mean_length: float
@@ -219,7 +219,7 @@ def collect_rollout(
         observation = result.observation
         if ended.any():
             observation = env.reset(ended, reset_seeds(seed, policy_version, step, num_envs, envs_per_start))
-        ended = (result.terminated | result.truncated) & result.valid
+        ended = result.ended & result.valid
     return Rollout(policy_version=policy_version, **{name: np.stack(rows) for name, rows in columns.items()})
 
 
@@ -254,7 +254,7 @@ def rollout_statistics(rollout: Rollout | TensorRollout) -> RolloutStatistics:
     first_TN: BoolArray = np.cumsum(ended_TN, 0) - ended_TN == 0
     returns_N = np.where(first_TN & valid_TN, rewards_TN, 0.0).sum(0, dtype=np.float64)
     lengths_N = (first_TN & (valid_TN | ended_TN)).sum(0)
-    successes, episodes = int((first_TN & terminated_TN).sum()), int(ended_N.sum())
+    successes, episodes = int((first_TN & terminated_TN & ~truncated_TN).sum()), int(ended_N.sum())
     begun = int((ended_N | valid_TN.any(0)).sum())
     last_TN: BoolArray = np.cumsum(ended_TN[::-1], 0)[::-1] == 0
     cut = int((last_TN & valid_TN).any(0).sum())

@@ -88,9 +88,9 @@ class Reply:
     states: FloatArray
     """(N, S)."""
     terminated: BoolArray
-    """(N,), the task is over."""
+    """(N,), as in LockStep."""
     truncated: BoolArray
-    """(N,), cut, or ended from outside until it is reset."""
+    """(N,), as in LockStep, or ended from outside until it is reset."""
     episode_ids: UInt64Array
     """(N,), of the observation returned."""
     success_probability: FloatArray
@@ -99,6 +99,11 @@ class Reply:
     """(N,), as in LockStep."""
     step_s: float = 0.0
     """Inside the environment, s."""
+
+    @property
+    def ended(self) -> BoolArray:
+        """(N,), the episode is over, for whichever reason."""
+        return self.terminated | self.truncated
 
     def check_follows(self, before: "Reply", reset: BoolArray) -> None:
         """Raise PeerLost where another client has reset the environment since `before`. reset: (N,), by this client."""

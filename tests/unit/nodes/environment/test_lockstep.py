@@ -26,10 +26,10 @@ N = 2
 
 
 class Fragile(ReachToy):
-    """Raises `error` in the next step, or gives NaN in environment 0, when told to."""
+    """Raises `error` in the next step, gives NaN in environment 0, or fails for good there, when told to."""
 
     error: Exception | None = None
-    nan = False
+    nan = failed = False
 
     def step(self, actions: FloatArray) -> StepResult:
         error, self.error = self.error, None
@@ -38,6 +38,8 @@ class Fragile(ReachToy):
         result = super().step(actions)
         if self.nan:
             result.observation.state[0] = np.nan
+        if self.failed:
+            result.terminated[0] = result.truncated[0] = True
         return result
 
 
@@ -115,6 +117,16 @@ def test_a_log_prob_or_value_that_nobody_named_is_nan() -> None:
     bench.served.step(bench.command())
     assert np.isnan(bench.transitions[-1].logprobs).all()
     assert np.isnan(bench.transitions[-1].values).all()
+
+
+def test_a_failure_for_good_is_both_flags_and_an_end_before_the_limit_by_neither_time_nor_doubt() -> None:
+    bench = Bench()
+    bench.environment.failed = True
+    reply = bench.served.step(bench.command())
+    assert reply.ended.tolist() == [True, False] and reply.terminated[0] and reply.truncated[0]
+    assert bench.transitions[-1].valid.all() and not bench.transitions[-1].success.any()
+    ends = [(note.reason, note.outcome) for note in bench.notes if note.kind == EpisodeEvent.KIND_END]
+    assert ends == [(EpisodeEvent.REASON_TERMINAL, EpisodeEvent.OUTCOME_FAILURE)]
 
 
 def test_nan_of_the_model_is_an_error_again_on_retry_and_nothing_of_it_is_valid_until_the_reset() -> None:

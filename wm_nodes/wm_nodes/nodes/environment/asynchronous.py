@@ -110,7 +110,7 @@ class AsynchronousEnvironment:
                 self._ended[:] = True
             raise
         self._is_waiting = False
-        self._ended = reply.terminated | reply.truncated
+        self._ended = reply.ended
         self._note(reply.stamp_ns)
         return action is not None or bool(reset is not None and reset.all())
 

@@ -175,7 +175,7 @@ class LockstepEnvironment:
                 reply = self._answer(plan, step, time.perf_counter() - started)
                 self._publish(plan, step)
                 self._last_command = command
-                goes_on = result.valid & ~result.terminated & ~result.truncated
+                goes_on = result.valid & ~result.ended
                 self._told_s = time.monotonic() if goes_on.any() else None
                 self._last_reply = _nan_error(broken, command.step_id) if broken.any() else reply
             if isinstance(self._last_reply, WireError):
@@ -210,7 +210,7 @@ class LockstepEnvironment:
             elif self._current is not None and self.spec.source != SOURCE_IMAGINED:
                 result = self.environment.step(self.hold_actions())
                 self._episodes.count_hold()
-                return result.terminated | result.truncated
+                return result.ended
             return np.zeros(self.spec.num_envs, bool)
 
     def hold_actions(self) -> FloatArray:

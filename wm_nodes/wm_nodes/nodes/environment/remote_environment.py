@@ -57,7 +57,7 @@ class RemoteEnvironment:
         reply.check_follows(self._last, np.zeros_like(self._ended))
         valid = ~self._ended
         self._steps = self._steps + valid.astype(np.uint32)
-        self._ended = self._ended | reply.terminated | reply.truncated
+        self._ended = self._ended | reply.ended
         self._last = reply
         unknown = np.full((self.spec.num_envs, self.spec.ground_truth_dim), np.nan, np.float32)
         return StepResult(

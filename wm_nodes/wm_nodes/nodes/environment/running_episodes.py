@@ -79,11 +79,12 @@ class RunningEpisodes:
             slot.version_first = slot.version_first if slot.length else version
             slot.version_last = version
             slot.length += 1
-            if step.terminated[i]:
+            if step.success[i]:
                 self._end(i, EpisodeEvent.OUTCOME_SUCCESS, EpisodeEvent.REASON_TERMINAL, step.next_stamp_ns)
             elif step.truncated[i]:
                 at_limit = slot.length + slot.holds >= self._max_steps
-                reason = EpisodeEvent.REASON_TIME_LIMIT if at_limit else EpisodeEvent.REASON_UNCERTAINTY
+                cut = EpisodeEvent.REASON_TIME_LIMIT if at_limit else EpisodeEvent.REASON_UNCERTAINTY
+                reason = EpisodeEvent.REASON_TERMINAL if step.terminated[i] else cut
                 self._end(i, EpisodeEvent.OUTCOME_FAILURE, reason, step.next_stamp_ns)
 
     def end(self, mask: BoolArray, reason: int, stamp_ns: int, *, abort: bool = False) -> None:

@@ -34,7 +34,7 @@ class SummaryWindow:
             del self._returns[next(iter(self._returns))]
         for i in np.flatnonzero(step.valid & step.ended):
             gained = self._returns.pop(int(step.episode_ids[i]), 0.0)
-            self._ended.append((gained, int(step.episode_steps[i]) + 1, bool(step.terminated[i])))
+            self._ended.append((gained, int(step.episode_steps[i]) + 1, bool(step.success[i])))
 
     def take(self) -> dict[str, float | int] | None:
         """Return the fields of RewardSummary and start again; None when no step was made. Means, minimum and maximum

@@ -115,7 +115,8 @@ class Stream:
         if step < len(self._signal):
             return  # published twice
         self._signal += [float("nan")] * (step - len(self._signal)) + [float(message.success_probability[0])]
-        self.about["end"] = "done" if message.terminated[0] else "cut" if message.truncated[0] else ""
+        ends = "", "done", "cut", "failed"
+        self.about["end"] = ends[bool(message.terminated[0]) + 2 * bool(message.truncated[0])]
         for stamp in (m.stamp_ns(message.header.stamp), reached):
             self._show(stamp)
 

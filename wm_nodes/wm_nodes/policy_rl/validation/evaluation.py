@@ -22,7 +22,7 @@ class EvaluationResult:
     """E episodes of one policy; arrays in the order of the seeds first_seed, first_seed + 1, ..."""
 
     success: BoolArray
-    """bool (E,), the episode terminated before its step limit."""
+    """bool (E,), the task was done before the step limit."""
     length: NDArray[np.uint32]
     """uint32 (E,), steps made."""
     first_seed: int
@@ -87,10 +87,10 @@ def evaluate(
         observation = result.observation
         played = result.valid & (playing >= 0)
         largest[playing[played]] = np.fmax(largest[playing[played]], result.ground_truth[played])
-        ended = (result.terminated | result.truncated) & played
+        ended = result.ended & played
         if not ended.any():
             continue
-        success[playing[ended]] = result.terminated[ended]
+        success[playing[ended]] = result.success[ended]
         length[playing[ended]] = observation.episode_step[ended]
         done += int(ended.sum())
         waiting = np.flatnonzero(ended)
