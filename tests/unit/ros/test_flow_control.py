@@ -19,6 +19,7 @@ from wm_nodes.recording.join import KEPT, Joiner
 from wm_nodes.ros.flow_control import SILENT_S, ConsumerCredits, ProducerCredits
 from wm_nodes.ros.liveliness import PeerWatch
 from wm_nodes.ros.sequence_numbers import BACK_RUN, GapTracker
+from wm_nodes.ros.wire import PeerLost
 
 N = 2
 
@@ -365,6 +366,13 @@ def full_assembler(left_out: tuple[str, int] = ("", 0)) -> RolloutAssembler:
     return assembler
 
 
+def test_a_rollout_whose_environment_was_restarted_before_it_was_taken_is_made_again() -> None:
+    assembler = full_assembler()
+    assembler.enter_session(2)
+    with pytest.raises(PeerLost, match="restarted"):
+        assembler.take(1, 1, 3, policy_version=3)
+
+
 def test_an_environment_that_restarts_while_a_rollout_is_taken_does_not_tear_it(
     monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -378,7 +386,7 @@ def test_an_environment_that_restarts_while_a_rollout_is_taken_does_not_tear_it(
         return found
 
     monkeypatch.setattr(assembler, "missing", missing_before_the_restart)
-    rollout, _ = assembler.take(1, 3, policy_version=3)
+    rollout, _ = assembler.take(1, 1, 3, policy_version=3)
     assert rollout.valid_TN.all()
     restart.join()
 
@@ -387,7 +395,7 @@ def test_a_complete_rollout_is_joined_by_stamp_and_step_id() -> None:
     assembler = full_assembler()
     assert assembler.missing(1, 1, 3) == []
     assert assembler.missing(2, 1, 3) == [1, 2, 3]
-    rollout, dropped = assembler.take(1, 3, policy_version=3)
+    rollout, dropped = assembler.take(1, 1, 3, policy_version=3)
     assert rollout.images_TN[:, 0, 0, 0, 0].tolist() == [1, 2, 3]
     assert rollout.next_images_TN[:, 0, 0, 0, 0].tolist() == [2, 3, 4]
     assert rollout.rewards_TN[:, 0].tolist() == [1, 2, 3]
@@ -401,7 +409,7 @@ def test_a_complete_rollout_is_joined_by_stamp_and_step_id() -> None:
 def test_what_is_missing_is_invalid_and_counted_never_zero(left_out: tuple[str, int], missing: list[int]) -> None:
     assembler = full_assembler(left_out)
     assert assembler.missing(1, 1, 3) == missing
-    rollout, dropped = assembler.take(1, 3, policy_version=3)
+    rollout, dropped = assembler.take(1, 1, 3, policy_version=3)
     assert [t + 1 for t in range(3) if not rollout.valid_TN[t].any()] == missing
     assert dropped.gap == N * len(missing)
 
@@ -411,7 +419,7 @@ def test_invalid_rewards_and_other_versions_are_left_out_by_reason() -> None:
     assembler.put_rewards(rewards(2, valid=False))
     assembler.put_rewards(rewards(2))  # the first ones count
     assembler.put_transition(step(3, version=2))
-    rollout, dropped = assembler.take(1, 3, policy_version=3)
+    rollout, dropped = assembler.take(1, 1, 3, policy_version=3)
     assert rollout.valid_TN.tolist() == [[True, True], [False, True], [False, False]]
     assert (dropped.invalid, dropped.gap, dropped.stale) == (1, 0, 2)
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from wm_nodes.core.lockstep import DroppedTransitions, LockStep, Rewards
 from wm_nodes.core.types import Rollout, UInt8Array
 from wm_nodes.recording.join import Joiner, begins_rollout, rollout_of, rollout_problem, version_of
+from wm_nodes.ros.wire import PeerLost
 
 MAX_WAITING = 2
 """Replayed rollouts that may wait for the learner before the player's credit is withheld."""
@@ -124,14 +125,19 @@ class RolloutAssembler:
             steps = self._current.steps if session == self._session else {}
             return [n for n in range(first, last + 1) if n not in steps or not self._joiner.is_complete(steps[n])]
 
-    def take(self, first: int, last: int, policy_version: int) -> tuple[Rollout, DroppedTransitions]:
+    def take(
+        self, session: int, first: int, last: int, policy_version: int
+    ) -> tuple[Rollout, DroppedTransitions]:
         """Return the rollout of step ids first..last. Incomplete steps are invalid and counted as gaps.
 
         Raises:
+            PeerLost: the environment was restarted since.
             ValueError: not a single step is complete.
         """
         with self._changed:
-            missing = set(self.missing(self._session, first, last))
+            if session != self._session:
+                raise PeerLost("the environment was restarted before its rollout was taken")
+            missing = set(self.missing(session, first, last))
             joined = self._joiner.joined
             steps = [None if n in missing else joined(self._current.steps[n]) for n in range(first, last + 1)]
         return rollout_of(steps, policy_version)

@@ -137,7 +137,7 @@ class LiveRollouts:
                     f"images or rewards of {len(missing)} lock-steps did not arrive; is every node active?"
                 )
             self._assembler.wait(0.1)
-        return self._assembler.take(result.first_step_id, result.last_step_id, version)
+        return self._assembler.take(*span, version)
 
     def _check_peers(self) -> None:
         namespace = self._node.get_namespace().rstrip("/")
