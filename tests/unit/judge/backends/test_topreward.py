@@ -17,7 +17,7 @@ from wm_nodes.apps.cli import main
 from wm_nodes.config.judge import JudgeConfig
 from wm_nodes.config.load import load_config
 from wm_nodes.judge.agent import topreward
-from wm_nodes.judge.agent.types import Stage, Status
+from wm_nodes.judge.agent.types import GATED, Stage, Status
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.entries import plain
 from wm_nodes.judge.audit.reading import read_record, verify
@@ -155,3 +155,16 @@ def test_a_field_that_only_the_judge_may_set_is_refused_on_the_command_line(
     assert main([*command, f"{FIELD}{name}=1"]) == 2
     assert f"judge.extra_body sets {name}, which the judge sets itself" in capsys.readouterr().err
     assert main([*command, f"{FIELD}{name}"]) == 2
+
+
+def test_its_message_has_every_stage_as_the_actions_count_them() -> None:
+    pytest.importorskip("wm_msgs.msg", reason="wm_msgs is not built")
+    from wm_nodes.nodes.judge.verdict_message import verdict_msg
+
+    (verdict,) = judged(ChatServer(labels=TRUE_OR_FALSE))
+    message = verdict_msg(verdict)
+    assert list(message.stages) == [*map(str, GATED)] and list(message.stage_passed) == [0, 0, 1, 0]
+    skipped = (message.SKIPPED, message.SKIPPED, message.OK, message.SKIPPED)
+    assert tuple(message.stage_status) == skipped and message.stage_scores[2] == pytest.approx(verdict.reward)
+    assert math.isnan(message.stage_scores[0]) and list(message.stage_vetoed_by) == [""] * 4
+    assert list(message.component_stages) == ["TC"]

@@ -5,6 +5,7 @@ from array import array
 from collections.abc import Iterable
 
 from wm_msgs.msg import ClipVerdict
+from wm_nodes.judge.agent.scoring import skipped_stage
 from wm_nodes.judge.agent.types import GATED, Status
 from wm_nodes.judge.agent.verdict import Reflection, Verdict
 
@@ -17,16 +18,18 @@ STATUS = {
 def verdict_msg(verdict: Verdict) -> ClipVerdict:
     """Everything of a verdict but which buffer or episode it is of, the header, session and seq."""
     cost, by, plan = verdict.cost, verdict.provenance, verdict.plan
-    parts = [(stage, component) for stage in verdict.stages for component in stage.components]
+    known = {stage.stage: stage for stage in verdict.stages}
+    stages = [known.get(stage, skipped_stage(stage)) for stage in GATED]  # mode topreward has one of them
+    parts = [(stage, component) for stage in stages for component in stage.components]
     return ClipVerdict(
         clip_id=verdict.clip_id, status=STATUS[verdict.status], reward=verdict.reward, reason=verdict.reason,
         level=verdict.level, level_p=_doubles(plan.p_level if plan else ()),
         level_weights=_doubles([plan.weights[stage] for stage in GATED] if plan else ()),
-        stages=[str(stage.stage) for stage in verdict.stages],
-        stage_scores=_doubles(stage.s for stage in verdict.stages),
-        stage_status=_bytes(STATUS[stage.status] for stage in verdict.stages),
-        stage_passed=_bytes(stage.passed for stage in verdict.stages),
-        stage_vetoed_by=[stage.vetoed_by for stage in verdict.stages], components=[part.component for _, part in parts],
+        stages=[str(stage.stage) for stage in stages],
+        stage_scores=_doubles(stage.s for stage in stages),
+        stage_status=_bytes(STATUS[stage.status] for stage in stages),
+        stage_passed=_bytes(stage.passed for stage in stages),
+        stage_vetoed_by=[stage.vetoed_by for stage in stages], components=[part.component for _, part in parts],
         component_stages=[str(stage.stage) for stage, _ in parts],
         component_scores=_doubles(part.s for _, part in parts),
         component_p_fail=_doubles(part.p_fail for _, part in parts),
