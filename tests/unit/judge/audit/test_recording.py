@@ -27,7 +27,7 @@ from scripted_judge import (
 )
 
 from wm_nodes.config.load import load_config
-from wm_nodes.judge.agent.judge import Cost, Read, ReadRequest
+from wm_nodes.judge.agent.judge import Cost, JudgeError, Read, ReadRequest
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.types import Status, clip_ref
@@ -187,6 +187,31 @@ def test_a_question_that_nobody_asked_is_an_error_that_names_it(tmp_path: Path) 
     after = counted_again(record, lenient, tmp_path / "lenient")
     assert after.status is Status.ERROR and math.isnan(after.reward)
     assert "the log has no answer on background, vote 0" in after.reason
+
+
+def test_every_clip_is_counted_again_by_what_was_said_of_it_then(tmp_path: Path) -> None:
+    """The same clip with two instructions, and with one of them again, after the judge did not answer."""
+
+    class Listening(ScriptedJudge):
+        """Sees an undone task where a green cube is named, and does not answer the first question."""
+
+        async def read(self, request: ReadRequest) -> list[Read]:
+            if not self.requests:
+                self.requests.append(request)
+                raise JudgeError("connection refused")
+            self.table = clean_table(RUBRIC, task_completion=WRONG if "green" in request.task.instruction else CLEAN)
+            return await super().read(request)
+
+    clip = make_clip()
+    red = make_task(clip)
+    jobs = [(clip, red), (clip, red), (clip, replace(red, instruction="push the green cube to the mark"))]
+    before = judge_all(tmp_path / "log", Listening(clean_table(RUBRIC)), jobs, mode="benchmark")
+    assert [verdict.valid for verdict in before] == [False, True, True] and before[1].reward > before[2].reward
+    record, rubric = read_record(tmp_path / "log"), load_rubric("robot", {"revision": 2})
+    with AuditLog(tmp_path / "again") as log:
+        after = asyncio.run(reaggregate(record, record.judged(), rubric, log))
+    np.testing.assert_array_equal([v.reward for v in after], [v.reward for v in before])
+    assert [v.reason for v in after] == [v.reason for v in before]
 
 
 def test_verify_names_a_picture_that_was_changed_and_a_cut_end(tmp_path: Path) -> None:

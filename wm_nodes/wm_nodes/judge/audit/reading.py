@@ -14,6 +14,9 @@ from wm_nodes.judge.audit.entries import clip_from, rubric_from, task_from, type
 from wm_nodes.judge.audit.log import NO_LINE, AuditError, Entry, faults, read_lines
 from wm_nodes.judge.audit.media import MediaStore
 
+Subject = tuple[str | None, ...]
+"""See subject_of."""
+
 
 @dataclass(frozen=True)
 class Failure:
@@ -129,6 +132,17 @@ class Record:
 
     def task(self, evaluation: RecordedEvaluation) -> TaskSpec:
         return task_from(evaluation.task, self.store)
+
+    def subject(self, evaluation: RecordedEvaluation) -> Subject:
+        """What was judged. Raises AuditError: a picture is missing or was changed."""
+        return subject_of(evaluation.sha256, self.task(evaluation))
+
+
+def subject_of(sha256: str, task: TaskSpec) -> Subject:
+    """What two evaluations have in common whose answers count for each other: the clip, and all that is said and shown
+    of its task."""
+    pictures = (None if one is None else media_sha(one, 0.0) for one in (task.reference_frame, task.goal_image))
+    return sha256, task.instruction, task.task_id, task.robot, *pictures
 
 
 def read_record(folder: Path) -> Record:

@@ -16,15 +16,19 @@ from wm_nodes.judge.agent.types import Component
 from wm_nodes.judge.agent.verdict import Verdict, content_hash
 from wm_nodes.judge.audit.entries import typed
 from wm_nodes.judge.audit.log import AuditError, AuditLog
-from wm_nodes.judge.audit.reading import Ask, Failure, Record, RecordedEvaluation
-from wm_nodes.judge.audit.recording import AuditedAgent
+from wm_nodes.judge.audit.reading import Ask, Failure, Record, RecordedEvaluation, Subject
+from wm_nodes.judge.audit.recording import AuditedAgent, RecordingJudge
 
 QuestionKey = tuple[str, str, tuple[Component, ...], tuple[Vote, ...], tuple[MediaItem, ...]]
 ReadKey = tuple[str, str, Component, Vote, tuple[MediaItem, ...]]
 
 
 class ReplayJudge:
-    """Answers from evaluations of one judge; the first answer to a question counts. Raises ValueError: no one judge."""
+    """Answers from evaluations of one clip and task by one judge; the first answer to a question counts.
+
+    Raises:
+        ValueError: no one judge.
+    """
 
     def __init__(self, evaluations: Sequence[RecordedEvaluation]) -> None:
         judges = {evaluation.agent.capabilities.judge_id for evaluation in evaluations}
@@ -103,14 +107,19 @@ async def reaggregate(
 ) -> list[Verdict]:
     """Work verdicts out under another rubric and write them, with all they rest on, into a log of their own.
 
+    A question that an evaluation did not put may be answered by another one of its clip and task by the same agent.
+
     Raises:
         AuditError: `rubric` asks in other words, or a picture is missing.
     """
+    alike: dict[tuple[int, Subject], list[RecordedEvaluation]] = {}
+    for each in record.judged():
+        alike.setdefault((each.agent.number, record.subject(each)), []).append(each)
 
     def judge_of(evaluation: RecordedEvaluation) -> tuple[Judge, Rubric]:
         check_questions(record.rubric(evaluation), rubric)
-        same = [other for other in record.judged() if other.agent.number == evaluation.agent.number]
-        return ReplayJudge(same), rubric
+        others = alike[evaluation.agent.number, record.subject(evaluation)]
+        return ReplayJudge([evaluation, *others]), rubric
 
     return await judge_again(record, evaluations, judge_of, log)
 
@@ -122,7 +131,7 @@ async def judge_again(
     """Judge the clips of a log once more, each as its agent was set then, and write that into a log of its own.
 
     Args:
-        judge_of: who judges, and by which rubric; asked once per agent.
+        judge_of: who judges, and by which rubric, which is one per agent.
 
     Raises:
         AuditError: a picture is missing.
@@ -130,10 +139,10 @@ async def judge_again(
     agents: dict[int, AuditedAgent] = {}
     verdicts = []
     for evaluation in evaluations:
-        number = evaluation.agent.number
+        number, (judge, rubric) = evaluation.agent.number, judge_of(evaluation)
         if number not in agents:
-            agents[number] = AuditedAgent(*judge_of(evaluation), log, **evaluation.agent.settings)
-        agents[number].round_number = evaluation.round_number
+            agents[number] = AuditedAgent(judge, rubric, log, **evaluation.agent.settings)
+        agents[number].judge, agents[number].round_number = RecordingJudge(judge, log), evaluation.round_number
         clip, task = record.clip(evaluation), record.task(evaluation)
         verdicts.append(await agents[number].evaluate(clip, task, evaluation.evidence))
     return verdicts
