@@ -120,7 +120,7 @@ def _agree(arguments: argparse.Namespace) -> None:
 def _people(arguments: argparse.Namespace) -> None:
     record, labels = read_record(arguments.log), [read_labels(path) for path in arguments.labels]
     chosen = [clip.evaluation for clip in join_labels(record, labels)]
-    judge, progress = HumanJudge(labels), tqdm(chosen, desc="people", disable=None)
+    judge, progress = HumanJudge(labels, record), tqdm(chosen, desc="people", disable=None)
     with AuditLog(arguments.output) as log:
         by_people = asyncio.run(judge_again(record, progress, lambda e: (judge, record.rubric(e)), log))
     pairs = [(evaluation.verdict, new) for evaluation, new in zip(chosen, by_people)]

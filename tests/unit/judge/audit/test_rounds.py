@@ -4,6 +4,7 @@ import asyncio
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from wm_nodes.judge.agent.judge import Read, ReadRequest
 from wm_nodes.judge.agent.levels import next_vote
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
-from wm_nodes.judge.agent.types import Profile, Stage, Status
+from wm_nodes.judge.agent.types import Profile, Stage, Status, TaskSpec
 from wm_nodes.judge.audit.agreement import AgreementRow, join_labels, report
 from wm_nodes.judge.audit.labels import FORMAT, read_labels
 from wm_nodes.judge.audit.log import AuditError
@@ -141,7 +142,8 @@ def test_people_are_a_judge_that_everybody_who_is_sure_votes_in(tmp_path: Path) 
         ("Bob", [everything(planning=2), everything()]),
         ("Cleo", [everything(clarity=False), everything(clarity=True, color=None)]),
     )]
-    judge, (first, second) = HumanJudge([read_labels(path) for path in said]), clips(2)
+    judge = HumanJudge([read_labels(path) for path in said], read_record(tmp_path / "log"))
+    first, second = clips(2)
     assert judge.capabilities.judge_id.startswith("human:") and "Ada, Bob, Cleo" in judge.capabilities.card
 
     def read(job: Job, stage: Stage, name: str) -> Read:
@@ -169,12 +171,32 @@ def test_what_people_pay_does_not_hang_on_the_order_of_their_files(tmp_path: Pat
     }
     files = [read_labels(write_labels(tmp_path / f"{n}.json", evaluations, [rows], n)) for n, rows in said.items()]
     rubrics = [load_rubric("robot", {"voting": {"audit_share": share}}) for share in (0.0, 1.0)]
+    record = read_record(tmp_path / "log")
     for number in (2, 3):
         for rubric in rubrics:
-            agents = [RewardAgent(HumanJudge(order), rubric) for order in permutations(files[:number])]
+            agents = [RewardAgent(HumanJudge(order, record), rubric) for order in permutations(files[:number])]
             verdicts = [asyncio.run(agent.evaluate(*clips(1)[0])) for agent in agents]
             assert len({verdict.audit_id for verdict in verdicts}) == 1
             assert verdicts[0].valid == (number == 3), "two people who differ pay nothing"
+
+
+def test_a_person_has_one_vote_on_a_clip_and_none_on_another_task_of_it(tmp_path: Path) -> None:
+    """Ada saw the clip twice with one instruction, and changed her mind, and once with another one."""
+    clip, red = clips(1)[0]
+    green = replace(red, instruction="push the green cube to the mark")
+    judge_all(tmp_path, ScriptedJudge(clean_table(RUBRIC)), [(clip, red), (clip, red), (clip, green)])
+    record = read_record(tmp_path)
+    undone = everything(task_completion=False)
+    said = {"Ada": [everything(), undone, everything()], "Bob": [undone]}
+    files = [read_labels(write_labels(tmp_path / who, record.judged(), [*rows], who)) for who, rows in said.items()]
+    judge = HumanJudge(files, record)
+
+    def levels(task: TaskSpec) -> tuple[float, ...]:
+        request = ReadRequest(clip, task, Stage.TC, ("task_completion",), Profile.E, (next_vote(1, 0),), ())
+        return asyncio.run(judge.read(request))[0].levels
+
+    assert levels(red) == WRONG and levels(green) == CLEAN
+    assert HumanJudge(files[::-1], record).capabilities == judge.capabilities
 
 
 def test_the_command_names_the_clips_that_are_paid_more_than_people_would(

@@ -11,24 +11,30 @@ from collections.abc import Sequence
 from wm_nodes.judge.agent.judge import Capabilities, Health, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.levels import one_hot, pool, settle
 from wm_nodes.judge.agent.types import NUM_PLAN_LEVELS, PLANNING, Stage, Status
-from wm_nodes.judge.audit.labels import HACK, HumanLabels, RowLabel, annotators
+from wm_nodes.judge.audit.labels import HACK, HumanLabels, RowLabel, annotators, find_evaluation
+from wm_nodes.judge.audit.reading import Record, Subject, subject_of
 
 SAID = {"pass": 4, "fail": 1}
 """The level that an answer without one stands for: clean, or clearly wrong."""
 
 
 class HumanJudge:
-    """Answers from exported labels, by the content of a clip, in whatever order the files come. It abstains where
-    nobody was sure, or as many say that a component passes as say that it fails. Raises AuditError: one person labelled
-    an evaluation twice.
+    """Answers from exported labels of a log's evaluations, by the content of a clip and its task, in whatever order the
+    files come. Of several evaluations of them, what a person said of the last one counts. It abstains where nobody was
+    sure, or as many say that a component passes as say that it fails.
+
+    Raises:
+        AuditError: one person labelled an evaluation twice, labels of another log, or a picture is missing.
     """
 
-    def __init__(self, files: Sequence[HumanLabels]) -> None:
+    def __init__(self, files: Sequence[HumanLabels], record: Record) -> None:
         self._people = sorted(annotators(files))
-        self._said: dict[str, list[dict[str, RowLabel]]] = defaultdict(list)
-        for file in files:
-            for label in file.labels:
-                self._said[label.sha256].append(label.rows)
+        self._said: dict[Subject, dict[str, dict[str, RowLabel]]] = defaultdict(dict)
+        given = [(label, file.annotator) for file in files for label in file.labels]
+        for label, who in sorted(given, key=lambda one: (one[1], one[0].evaluation)):
+            evaluation = find_evaluation(label.evaluation, label.audit_id, record.evaluations, f"labels of {who}")
+            said = self._said[record.subject(evaluation)]
+            said[who] = {**said.get(who, {}), **label.rows}
         content = "".join(sorted(file.model_dump_json() for file in files))
         self._sha = hashlib.sha256(content.encode()).hexdigest()[:12]
 
@@ -43,7 +49,7 @@ class HumanJudge:
         return Health(True, "answers from labels")
 
     async def read(self, request: ReadRequest) -> list[Read]:
-        said = self._said.get(request.clip.sha256, [])
+        said = [*self._said.get(subject_of(request.clip.sha256, request.task), {}).values()]
         prefix = HACK if request.stage is Stage.HACK else ""
         return [_answer(name, prefix + name, vote, said) for name in request.components for vote in request.votes]
 
