@@ -517,6 +517,16 @@ def test_second_run_is_bit_equal_and_sends_nothing(tmp_path: Path) -> None:
     assert all(read.cost.wall_s == 0 for read in runs[2])
 
 
+def test_a_second_run_measures_the_servers_cache_as_the_first_whatever_was_asked_twice(tmp_path: Path) -> None:
+    async def steps(judge: OpenAIJudge) -> float:
+        await judge.read(request(components=["clarity", "brightness", "color", "temporal"], mode="auto"))
+        return (await judge.health()).details["cached_ratio"]
+
+    settings = asked_by(repeat_share=1.0)
+    first, again = (judging(steps, ChatServer(), settings=settings, cache=VerdictCache(tmp_path)) for _ in range(2))
+    assert 0 < first < 1 and again == first
+
+
 def test_whatever_changes_the_answer_changes_the_key(tmp_path: Path) -> None:
     def sent(asked: ReadRequest, **options: Any) -> int:
         server = ChatServer()

@@ -35,7 +35,8 @@ class OpenAIJudge:
 
     Args:
         settings: how it is asked; endpoints, model and key are the transport's.
-        cache: reads bought before; a hit repeats the Reads with the cost they had then, wall_s 0.
+        cache: reads bought before; a hit repeats the Reads with the cost they had then, wall_s 0, without that of
+            asking the same twice.
         on_exchange: called with the words of every request and its raw reply, or with "cached" in place of one.
 
     Raises:
@@ -135,6 +136,8 @@ class OpenAIJudge:
         known = None if self._cache is None else self._cache.get(key)
         if known is None:
             reads = await self._ask(call, prompt)
+            if self._cache is not None:
+                self._cache.put(key, reads)
         else:  # what they cost then, but no time
             reads = [replace(read, cost=replace(read.cost, wall_s=0.0)) for read in known]
         cost = reads[0].cost
@@ -142,8 +145,6 @@ class OpenAIJudge:
             self._on_exchange({**describe_request(call, prompt.body), "cached": True})
         elif int(key[:8], 16) < self._settings.repeat_share * 16**8 and not _is_unanswered(reads):
             reads = await self._repeat_call(call, prompt, reads)
-        if known is None and self._cache is not None:
-            self._cache.put(key, reads)
         self._plan.observe(cost, follows=follows)
         self._counts["reads"] += len(reads)
         self._counts["cache_hits"] += known is not None
