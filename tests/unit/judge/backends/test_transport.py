@@ -75,6 +75,17 @@ def test_one_failure_is_retried_and_costs_one_try(fault: Fault) -> None:
     assert talk(ask, server).tries == 2
 
 
+@pytest.mark.parametrize("count", [-1, 2**64])
+def test_an_answer_of_tokens_that_no_message_can_carry_is_none(count: int) -> None:
+    class Miscounting(ChatServer):
+        def _completion(self, body: dict[str, Any], fault: Fault | None) -> str:
+            whole = json.loads(super()._completion(body, fault))
+            return json.dumps({**whole, "usage": {"prompt_tokens": count, "completion_tokens": 1}})
+
+    with pytest.raises(TransportError, match=r"HTTP 200 without a chat completion: usage\.prompt_tokens"):
+        talk(ask_patiently, Miscounting())
+
+
 @pytest.mark.parametrize("status", [400, 401, 403, 404, 413, 422])
 def test_refusals_are_never_retried(status: int) -> None:
     server = ChatServer()
@@ -125,7 +136,7 @@ def test_retry_after_reads_seconds_and_dates_and_nothing_else() -> None:
     assert retry_after_s({"retry-after": "7"}) == 7
     assert 28 <= retry_after_s({"retry-after": soon}) <= 30
     past = format_datetime(datetime.now(UTC) - timedelta(seconds=30), usegmt=True)
-    assert [retry_after_s({"retry-after": text}) for text in (past, "soon", "nan", "inf", "-3", "")] == [0.0] * 6
+    assert [retry_after_s({"retry-after": text}) for text in (past, "soon", "nan", "inf", "-3", "", "²")] == [0.0] * 7
     assert retry_after_s({}) == 0
 
 

@@ -1,8 +1,11 @@
 """The part of a chat completion that a judge reads; servers add more, which is dropped."""
 
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import BaseModel, Field
+
+Count = Annotated[int, Field(ge=0, lt=2**31)]
+"""Fits into messages, also many together."""
 
 
 class TopLogprob(BaseModel):
@@ -41,15 +44,15 @@ class Choice(BaseModel):
 
 
 class PromptTokens(BaseModel):
-    cached_tokens: int | None = None
+    cached_tokens: Count | None = None
 
 
 class Usage(BaseModel):
     """Tokens of a request."""
 
-    prompt_tokens: int = 0
+    prompt_tokens: Count = 0
     """Sent."""
-    completion_tokens: int = 0
+    completion_tokens: Count = 0
     """Received."""
     prompt_tokens_details: PromptTokens | None = None
     """How many of them the server had."""

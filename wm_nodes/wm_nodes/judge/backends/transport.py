@@ -340,7 +340,7 @@ def _left_s(deadline: float | None) -> float | None:
 def retry_after_s(headers: Mapping[str, str]) -> float:
     """Seconds that a Retry-After header asks for, as a number or as an HTTP date; 0 without a readable one."""
     value = headers.get("retry-after", "").strip()
-    if value.isdigit():
+    if value.isdecimal():
         return float(value)
     with contextlib.suppress(ValueError):
         moment = parsedate_to_datetime(value)
