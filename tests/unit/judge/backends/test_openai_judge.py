@@ -472,6 +472,9 @@ def test_low_label_mass_abstains_except_under_a_grammar() -> None:
     (read,) = reads_of(request(components=["clarity"], votes=[LABEL]), ChatServer(labels=labels))
     assert (read.status, read.levels) == (Status.ABSTAIN, ()) and read.label_mass == pytest.approx(0.3)
     assert "label mass 0.300 is below 0.5" in read.reason
+    lenient = load_rubric("robot", {"voting": {"min_label_mass": 0.25}})
+    (read,) = reads_of(request(components=["clarity"], votes=[LABEL]), ChatServer(labels=labels), rubric=lenient)
+    assert (read.status, read.label_mass) == (Status.OK, pytest.approx(0.3))
     server = ChatServer(labels=labels)
     settings = asked_by(choice_grammar=True, label_token_ids=[65, 66, 67, 68, 69])
     (read,) = reads_of(request(components=["clarity"], votes=[LABEL]), server, settings=settings)

@@ -28,8 +28,6 @@ MEASURED_CALLS = 200
 SEED_LIMIT = 2**31
 MAX_ANSWER_TOKENS = 1024
 """Of a JSON answer, if extra_body sets none; one that needs more has failed."""
-MIN_LABEL_MASS = 0.5
-"""A label read with less abstains, unless its answers are chosen by a grammar."""
 OWN_FIELDS = frozenset((
     "model", "messages", "seed", "response_format", "logprobs", "top_logprobs", "logprob_token_ids",
     "structured_outputs", "stream", "n",
@@ -161,8 +159,9 @@ class Caller:
         words = topreward.WORDS if truth else LETTERS[: len(order)]
         probabilities, mass = option_probabilities(answer.completion, words)
         self.label_masses.append(mass)
-        if mass == 0 or (mass < MIN_LABEL_MASS and not constrained):
-            reason = f"label mass {mass:.3f} is below {MIN_LABEL_MASS}"
+        least = self._prompts.rubric.voting.min_label_mass
+        if mass == 0 or (mass < least and not constrained):
+            reason = f"label mass {mass:.3f} is below {least}"
             return Read(component, (), "label", call.vote, mass, Status.ABSTAIN, reason)
         levels = topreward.levels_of(probabilities) if truth else map_back(probabilities, order)
         return Read(component, levels, "label", call.vote, 1.0 if constrained else mass)
