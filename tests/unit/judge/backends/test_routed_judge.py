@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 from judge_server import PickyServer, serving
-from scripted_judge import CLEAN, COOKING, WRONG, ScriptedJudge, clean_table, make_clip, make_task
+from scripted_judge import CLEAN, COOKING, WRONG, FaultyJudge, ScriptedJudge, clean_table, make_clip, make_task
 
 from wm_nodes.config.judge import JudgeConfig
 from wm_nodes.config.load import ConfigError, load_config
-from wm_nodes.judge.agent.judge import Capabilities, Judge, Read, ReadRequest
-from wm_nodes.judge.agent.levels import next_vote
+from wm_nodes.judge.agent.judge import Capabilities, Cost, Judge, JudgeError, Read, ReadRequest
+from wm_nodes.judge.agent.levels import first_vote, next_vote, settle
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.types import GATED, Profile, Stage, Status
@@ -54,6 +54,18 @@ def test_second_looks_go_to_whoever_reads_the_components_own_stage() -> None:
         looks = [name for r in judge.requests if r.stage is Stage.REFLECT for name in r.components]
         assert looks and {RUBRIC.stage_of(name) for name in looks} <= stages
     assert found.reflections == verdict_of(ScriptedJudge(table, second={"interaction": CLEAN})).reflections
+
+
+def test_a_second_look_that_one_judge_does_not_answer_costs_what_the_others_answers_did() -> None:
+    table = clean_table(RUBRIC, interaction=WRONG)
+    first, other = ScriptedJudge(table), FaultyJudge(table, "interaction", "unavailable")
+    clip = make_clip()
+    names = ("task_completion", "interaction")
+    prior = tuple(settle([Read(name, CLEAN, "json", first_vote(0))], 0.5) for name in names)
+    request = ReadRequest(clip, make_task(clip), Stage.REFLECT, names, Profile.D, (first_vote(0),), (), prior=prior)
+    with pytest.raises(JudgeError, match="circuit open") as caught:
+        asyncio.run(RoutedJudge(first, [([Stage.PC], other)], RUBRIC).read(request))
+    assert caught.value.cost == Cost(calls=1 + 4, prompt_tokens=10, retries=3)
 
 
 def test_other_routes_are_another_judge_and_the_order_of_stages_is_not() -> None:

@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 
-from wm_nodes.judge.agent.judge import Capabilities, Health, Judge, Read, ReadRequest
+from wm_nodes.judge.agent.judge import Capabilities, Health, Judge, JudgeError, Read, ReadRequest
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import PLANNING, Component, Stage
 
@@ -63,7 +63,10 @@ class RoutedJudge:
             parts.setdefault(id(judge), (judge, []))[1].append(name)
         reads: list[Read] = []
         for judge, names in parts.values():
-            reads += await judge.read(replace(request, components=tuple(names)))
+            try:
+                reads += await judge.read(replace(request, components=tuple(names)))
+            except JudgeError as error:
+                raise JudgeError(str(error), sum((read.cost for read in reads), error.cost)) from error
         return reads
 
     async def health(self) -> Health:
