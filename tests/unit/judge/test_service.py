@@ -33,7 +33,7 @@ from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.media import FOLDER
 from wm_nodes.judge.audit.reading import read_record
 from wm_nodes.judge.backends.factory import check_judge
-from wm_nodes.judge.episode_reward import EpisodeReward, PendingReward, check_horizon, unjudged_reason
+from wm_nodes.judge.episode_reward import EpisodeReward, PendingReward, check_agent, check_horizon, unjudged_reason
 from wm_nodes.judge.service import ClipJob, JudgeService
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.graph import Graph, GraphError
@@ -234,6 +234,12 @@ def test_rollouts_in_which_no_episode_of_full_length_ends_are_refused_by_value_a
     check_horizon(16, 16)
     with pytest.raises(ValueError, match=r"ppo\.num_steps is 15, .* 16 steps: .* at least that many"):
         check_horizon(15, 16)
+
+
+def test_a_task_of_several_is_refused_because_no_judge_would_be_told_which_one_an_episode_is_of() -> None:
+    check_agent(load_config("cpu", {"task": "push", "judge.kind": "embedded"}))
+    with pytest.raises(ValueError, match=r"'all_tasks' is of one of .*push.*name one of them, or another reward"):
+        check_agent(load_config("cpu", {"task": "all_tasks", "judge.kind": "embedded"}))
 
 
 def test_a_rollout_without_an_ended_episode_pauses_instead_of_looking_like_a_failure() -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from wm_nodes.config.judge import JudgeConfig
 from wm_nodes.config.load import judge_or_embedded
 from wm_nodes.config.schema import AGENT, RunConfig
+from wm_nodes.config.tasks import parts_of
 from wm_nodes.core.lockstep import LockStep
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import BoolArray, FloatArray, Rollout, UInt8Array
@@ -107,9 +108,15 @@ def check_agent(config: RunConfig, *, trains: bool = True) -> None:
     trains: rollouts of ppo.num_steps are trained on.
 
     Raises:
-        ValueError, ConfigError: as check_judge, load_rubric, check_horizon and check_clips.
+        ValueError, ConfigError: as check_judge, load_rubric, check_horizon and check_clips; or the task is one of
+            several, and nobody tells the judge which.
     """
     check_judge(config.judge)
+    if len(parts := parts_of(config.task)) > 1:
+        raise ValueError(
+            f"an episode of task {config.task!r} is of one of {', '.join(parts)}, and the reward agent is not told of "
+            "which, so that it could judge none; name one of them, or another reward"
+        )
     load_rubric(config.judge.rubric)
     spec = configured_spec(config)
     if trains:
