@@ -32,7 +32,7 @@ from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.media import FOLDER
 from wm_nodes.judge.audit.reading import read_record
-from wm_nodes.judge.backends.factory import check_judge
+from wm_nodes.judge.backends.factory import check_judge, judge_name
 from wm_nodes.judge.episode_reward import EpisodeReward, PendingReward, check_agent, check_horizon, unjudged_reason
 from wm_nodes.judge.service import ClipJob, JudgeService
 from wm_nodes.launching import arguments as launch_arguments
@@ -325,6 +325,15 @@ def test_the_settings_of_loop_2_hold_the_judges_and_come_back_from_their_file(tm
     (tmp_path / "config.yaml").write_text(dump_config(config))
     assert load_video_config(str(tmp_path / "config.yaml")) == config
     assert load_video_config("smoke").judge == load_config("smoke").judge
+
+
+def test_a_named_judge_judges_whatever_judge_a_saved_configuration_has(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(dump_config(load_config("cpu", judge_overrides(str(tmp_path)))))
+    by_server = load_config(str(file), judge_overrides("http://a/v1", "judge")).judge
+    assert judge_name(by_server) == "judge at http://a/v1"
+    by_default = load_config(str(file), judge_overrides("embedded")).judge
+    assert judge_name(by_default) == "embedded judge of the task"
 
 
 def test_the_command_refuses_an_agent_without_a_judge_before_anything_is_made(

@@ -96,12 +96,14 @@ def judge_overrides(endpoints: str = "", model: str = "", api_key_env: str = "",
         endpoints: base URLs, separated by commas; or, for a judge in this process, EMBEDDED or a world-model folder.
         rubric: a pack's name, or a file, from then on by its full path.
     """
-    embedded: dict[str, str] = {}
+    named: dict[str, Any] = {}  # all that says who judges, so that a configuration that says otherwise does not
     if endpoints == EMBEDDED or (endpoints and Path(endpoints).is_dir()):
-        embedded = {"kind": EMBEDDED, "folder": "" if endpoints == EMBEDDED else str(Path(endpoints).absolute())}
-    urls = [] if embedded else [url.strip() for url in endpoints.split(",") if url.strip()]
-    values = {"endpoints": urls, "model": model, "api_key_env": api_key_env, "rubric": named_pack(rubric), **embedded}
-    return {f"judge.{name}": value for name, value in values.items() if value}
+        named = {"kind": EMBEDDED, "folder": "" if endpoints == EMBEDDED else str(Path(endpoints).absolute())}
+    elif urls := [url.strip() for url in endpoints.split(",") if url.strip()]:
+        named = {"kind": "openai", "endpoints": urls}
+    about = {"model": model, "api_key_env": api_key_env, "rubric": named_pack(rubric)}
+    named |= {name: value for name, value in about.items() if value}
+    return {f"judge.{name}": value for name, value in named.items()}
 
 
 def judge_or_embedded(judge: JudgeConfig) -> JudgeConfig:
