@@ -76,6 +76,12 @@ def test_a_space_more_is_a_change(folder: Path) -> None:
     assert fault.number == 1
 
 
+@pytest.mark.parametrize("number", [b"Infinity", b"[" * 100_000])
+def test_a_line_whose_number_cannot_be_read_is_named(folder: Path, number: bytes) -> None:
+    (fault,) = changed(folder, lambda lines: [lines[0], lines[1].replace(b'"line":2', b'"line":' + number), *lines[2:]])
+    assert (fault.number, fault.torn) == (2, False) and "no line of an audit log" in str(fault)
+
+
 @pytest.mark.parametrize("cut", [1, 20, 100])
 def test_a_torn_last_line_is_told_cut_off_and_kept(folder: Path, cut: int) -> None:
     path = folder / FILE_NAME

@@ -269,7 +269,7 @@ def _parse(raw: bytes, number: int, start: int, expected: int, previous: str) ->
         line = json.loads(raw)
         kind, body, digest = str(line["kind"]), dict(line["body"]), str(line["hash"])
         stated, follows = int(line["line"]), line["previous"]
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
         what = f"{len(raw)} bytes that are no line of an audit log"
         return Fault(number, what, start, torn=True), expected + 1, ""
     about, after = f"a {kind} line", stated + 1
