@@ -19,6 +19,7 @@ from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.audit.agreement import join_labels, report, table
 from wm_nodes.judge.audit.entries import plain
 from wm_nodes.judge.audit.labels import read_labels
+from wm_nodes.judge.audit.log import FILE_NAME as LOG
 from wm_nodes.judge.audit.log import AuditError, AuditLog, recover
 from wm_nodes.judge.audit.people import HumanJudge
 from wm_nodes.judge.audit.reading import read_record, verify
@@ -94,6 +95,8 @@ def _sample(arguments: argparse.Namespace) -> None:
 
 
 def _view(arguments: argparse.Namespace) -> None:
+    if arguments.second and not arguments.sample:
+        raise AuditError("which clips a second annotator should see, a sample says; name it with --sample")
     record = read_record(arguments.log)
     sample = read_sample(arguments.sample) if arguments.sample else None
     wanted = {clip.evaluation for clip in sample.chosen if clip.second or not arguments.second} if sample else None
@@ -121,7 +124,7 @@ def _people(arguments: argparse.Namespace) -> None:
     record, labels = read_record(arguments.log), [read_labels(path) for path in arguments.labels]
     chosen = [clip.evaluation for clip in join_labels(record, labels)]
     judge, progress = HumanJudge(labels, record), tqdm(chosen, desc="people", disable=None)
-    with AuditLog(arguments.output) as log:
+    with _new_log(arguments.output) as log:
         by_people = asyncio.run(judge_again(record, progress, lambda e: (judge, record.rubric(e)), log))
     pairs = [(evaluation.verdict, new) for evaluation, new in zip(chosen, by_people)]
     both = [(old.clip_id, (old.reward, new.reward)) for old, new in pairs if old.valid and new.valid]
@@ -137,6 +140,13 @@ def _people(arguments: argparse.Namespace) -> None:
     print(f"wrote {arguments.output}; view and verify it as any log")
 
 
+def _new_log(folder: Path) -> AuditLog:
+    """Raises AuditError: the folder holds one, whose rounds would have every clip twice."""
+    if (folder / LOG).exists():
+        raise AuditError(f"{folder} holds an audit log already; name a new folder with --output")
+    return AuditLog(folder)
+
+
 def _replay(arguments: argparse.Namespace) -> int:
     record = read_record(arguments.log)
     evaluations = record.judged(arguments.round)
@@ -145,7 +155,7 @@ def _replay(arguments: argparse.Namespace) -> int:
         if arguments.output is None:
             raise AuditError("a replay under another rubric needs --output, the folder of its own log")
         rubric = load_rubric(arguments.rubric)
-        with AuditLog(arguments.output) as log:
+        with _new_log(arguments.output) as log:
             verdicts = asyncio.run(reaggregate(record, progress, rubric, log))
         open_ones = sum(not verdict.valid for verdict in verdicts)
         print(f"{len(verdicts)} verdicts under {rubric.version} in {arguments.output}, {open_ones} without a number")

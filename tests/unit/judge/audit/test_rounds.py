@@ -323,7 +323,13 @@ def test_other_numbers_are_judged_from_the_old_log_by_a_command(
     assert "3 verdicts under robot-3-" in capsys.readouterr().out
     passed = [e.verdict.stages[0].passed for e in read_record(tmp_path / "new").judged()]
     assert passed == [True, False, True]
+    for there in ("new", "old"):
+        assert main([*other, "--output", str(tmp_path / there)]) == 2
+        assert "holds an audit log already; name a new folder" in capsys.readouterr().err
+        assert len(read_record(tmp_path / there).judged()) == 3
     assert main(["audit", "verify", str(tmp_path / "new")]) == 0
+    assert main(["audit", "view", str(tmp_path / "new"), "--second"]) == 2
+    assert "name it with --sample" in capsys.readouterr().err
     assert main(["audit", "sample", str(tmp_path / "new"), "--output", str(tmp_path / "s.json")]) == 0
     assert read_sample(tmp_path / "s.json").population == 3
     assert main(["audit", "agree", str(tmp_path / "nothing"), "--labels", "x"]) == 2
