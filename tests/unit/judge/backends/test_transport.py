@@ -387,3 +387,22 @@ def test_served_models_are_listed_and_silent_servers_left_out() -> None:
     talk(steps, ChatServer())
     gone = ChatTransport([Endpoint("http://127.0.0.1:9/v1", "judge")])
     assert asyncio.run(gone.served_models()) == {}
+
+
+@pytest.mark.parametrize(
+    ("listing", "served"),
+    [("{}", [[]]), ('{"data": null}', [[]]), ('{"data": [{"id": "judge", "owned_by": 3}]}', [["judge"]]), ("null", []),
+     ('{"data": [{}]}', []), ('["judge"]', []), ("[" * 100_000, [])],
+    ids=["empty", "null_data", "one", "null", "no_name", "list", "nested"],
+)
+def test_a_server_that_lists_its_models_otherwise_or_not_at_all_is_told_and_nothing_falls(
+    listing: str, served: list[list[str]]
+) -> None:
+    class Listing(ChatServer):
+        async def _send(self, writer: asyncio.StreamWriter, status: int, text: str, *more: Any) -> None:
+            await super()._send(writer, status, listing)
+
+    async def steps(transport: ChatTransport, server: ChatServer) -> None:
+        assert [*(await transport.served_models()).values()] == served
+
+    talk(steps, Listing())

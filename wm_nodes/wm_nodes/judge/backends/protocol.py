@@ -1,4 +1,4 @@
-"""The part of a chat completion that a judge reads; servers add more, which is dropped."""
+"""The parts of a chat completion and of a list of models that a judge reads; servers add more, which is dropped."""
 
 from typing import Annotated, Any
 
@@ -71,3 +71,13 @@ class Completion(BaseModel):
     """Its name."""
     usage: Usage = Field(default_factory=Usage)
     """What it took."""
+
+
+class ListedModel(BaseModel):
+    id: str
+
+
+class ModelList(BaseModel):
+    """What a server says that it serves; some say nothing."""
+
+    data: list[ListedModel] | None = None

@@ -22,7 +22,7 @@ from pydantic import ValidationError
 from wm_nodes.core.imports import optional_package
 from wm_nodes.judge.audit.log import MIN_SECRET
 from wm_nodes.judge.backends.limits import AdaptiveLimit, Admission, CircuitBreaker
-from wm_nodes.judge.backends.protocol import Completion
+from wm_nodes.judge.backends.protocol import Completion, ModelList
 
 CONNECT_S = 5.0
 OVERLOAD = (429, 503)
@@ -178,10 +178,11 @@ class ChatTransport:
         for server in self._servers:
             try:
                 async with asyncio.timeout(2 * CONNECT_S):
-                    page = await server.client.models.list()
+                    raw = await server.client.models.with_raw_response.list()
+                listed = ModelList.model_validate_json(raw.http_response.text)
             except (self._openai.OpenAIError, TimeoutError, ValueError):
                 continue
-            models[server.endpoint.base_url] = [model.id for model in page.data]
+            models[server.endpoint.base_url] = [model.id for model in listed.data or ()]
         return models
 
     async def complete(self, body: Mapping[str, Any], *, timeout_s: float, deadline: float | None = None) -> ChatAnswer:
