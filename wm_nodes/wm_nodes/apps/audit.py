@@ -89,8 +89,9 @@ def _sample(arguments: argparse.Namespace) -> None:
     write_sample(path, sample)
     drawn = Counter(clip.stratum for clip in sample.chosen)
     by = ", ".join(f"{drawn[name]} of {count} {name}" for name, count in sample.sizes.items())
-    print(f"{len(sample.chosen)} of {sample.population} clips of round {sample.round_number}, mean reward "
-          f"{sample.mean_reward:.3f}: {by}; {sum(clip.second for clip in sample.chosen)} for two people")
+    mean = "no reward" if sample.mean_reward is None else f"mean reward {sample.mean_reward:.3f}"
+    print(f"{len(sample.chosen)} of {sample.population} clips of round {sample.round_number}, {mean}: {by}; "
+          f"{sum(clip.second for clip in sample.chosen)} for two people")
     print(f"wrote {path}")
 
 

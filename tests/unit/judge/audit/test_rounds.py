@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from audit_logs import Job, JudgeByClip, clips, judge_all
-from scripted_judge import CLEAN, FLAWED, WRONG, ScriptedJudge, clean_table
+from scripted_judge import CLEAN, FLAWED, WRONG, FaultyJudge, ScriptedJudge, clean_table
 
 from wm_nodes.apps.cli import main
 from wm_nodes.core.statistics import wilson_interval
@@ -126,6 +126,13 @@ def test_equal_verdicts_and_seeds_choose_equal_clips(tmp_path: Path) -> None:
     with pytest.raises(AuditError, match=r"no verdict of round 3; rounds: \[0\]"):
         draw(read_record(tmp_path / "a"), 3)
     assert sum(SHARES.values()) == pytest.approx(0.6)
+
+
+def test_a_round_without_a_reward_has_no_mean_of_0(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    judge_all(tmp_path, FaultyJudge(clean_table(RUBRIC), "robot", "unavailable"), clips(2))
+    assert main(["audit", "sample", str(tmp_path)]) == 0
+    assert "2 of 2 clips of round 0, no reward: " in capsys.readouterr().out
+    assert read_sample(tmp_path / "sample-0.json").mean_reward is None
 
 
 # --- people as the judge ------------------------------------------------------------------------------------------

@@ -65,8 +65,8 @@ class Sample:
     """Of the draw."""
     population: int
     """Clips of the round with a verdict."""
-    mean_reward: float
-    """Of those with one."""
+    mean_reward: float | None
+    """Of those with one; None where no clip has one, which counts as 0 for the size."""
     sizes: dict[str, int]
     """Clips by stratum."""
     chosen: tuple[SampledClip, ...]
@@ -94,8 +94,8 @@ def draw(record: Record, round_number: int, *, seed: int = 0, size: int | None =
     if size is not None and size < 1:
         raise ValueError(f"size must be >= 1, got {size}")
     rewards = [e.verdict.reward for e in pool if e.verdict.valid]
-    mean = float(np.mean(rewards)) if rewards else 0.0
-    count = sample_size(mean, len(pool)) if size is None else min(size, len(pool))
+    mean = float(np.mean(rewards)) if rewards else None
+    count = sample_size(mean or 0.0, len(pool)) if size is None else min(size, len(pool))
     strata = [stratum_of(evaluation, record.rubric(evaluation)) for evaluation in pool]
     strata = _mark_top(pool, strata, round(SHARES["top_reward"] * len(pool)))
     rng = numpy_stream(seed, "audit_sample", round_number)
