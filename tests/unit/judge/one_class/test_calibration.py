@@ -4,6 +4,7 @@ import functools
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -114,6 +115,12 @@ def test_too_few_too_short_or_too_small_recordings_are_refused() -> None:
     narrow = replace(episodes()[0], states=episodes()[0].states[:, :2])
     with pytest.raises(ValueError, match=r"states of 2 values, the world model knows 3 \(tool_target_x, .*wm collect"):
         calibrate(models(), [narrow], stride=1, seed=0)
+
+
+@pytest.mark.parametrize("lacks", [{"probe": None}, {"tasks": ("pour tea",)}], ids=["probe", "positions"])
+def test_a_model_that_reads_no_places_is_refused_with_what_helps(lacks: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"where tool and object are, and that of .* does not: .*--judge URL"):
+        calibrate(replace(models(), **lacks), episodes()[:2], stride=1, seed=0)
 
 
 def test_a_task_counts_as_done_by_its_own_rule_in_recordings_of_its_scene() -> None:

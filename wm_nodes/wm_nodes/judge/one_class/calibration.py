@@ -176,8 +176,13 @@ def _check_sizes(models: WorldModels, episodes: Sequence[Episode]) -> None:
 
 def _places(models: WorldModels, episodes: Sequence[Episode]) -> tuple[FloatArray, float]:
     """Origin and height_m of NormalRanges, of the first recordings."""
-    if models.probe is None:
-        raise ValueError("the embedded judge needs a world model with a position probe; train it anew")
+    placed = [len(columns_of(models.tasks[0], thing)) for thing in ("tool", "object")]
+    if models.probe is None or placed != [3, 2]:
+        raise ValueError(
+            "the embedded judge needs a world model that reads off its pictures where tool and object are, and that of "
+            f"{', '.join(models.tasks)} does not: that takes recordings with ground truth, of a task whose file "
+            "names these positions (environments/maniskill/tasks); a server judges without (--judge URL)"
+        )
     tools = [models.probe.read(episode.images)[:, columns_of(models.tasks[0], "tool")] for episode in episodes[:50]]
     if not tools:
         raise ValueError("the bags hold no episode that is long enough; name more bags")
