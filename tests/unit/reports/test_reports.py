@@ -117,9 +117,13 @@ def test_a_run_of_several_tasks_shows_the_real_success_of_each(tmp_path: Path) -
     assert "Real success by task" not in write_report(tmp_path, SUMMARY, [], config_text="").read_text()
 
 
-def test_a_marked_step_is_shown_and_framed_in_green() -> None:
-    picture = film_strip({"real": frames(17, 40)}, scale=4, max_columns=5, marks={"real": 7})
-    assert blocks_of(picture, (47, 40, 40)) and blocks_of(picture, (30, 170, 80))
+@pytest.mark.parametrize("others", [{}, {"imagined": 8}, {"imagined": 6}, {"imagined": 1}])
+def test_a_marked_step_is_shown_and_framed_in_green(others: dict[str, int]) -> None:
+    rows = {"real": frames(17, 40)} | {name: frames(17, 90) for name in others}
+    picture = film_strip(rows, scale=4, max_columns=5, marks={"real": 7, **others})
+    assert blocks_of(picture, (47, 40, 40)), "the step of the first row is shown"
+    one = blocks_of(film_strip({"real": frames(17, 40)}, scale=4, marks={"real": 7}), (30, 170, 80))
+    assert one and blocks_of(picture, (30, 170, 80)) == one * len(rows)
 
 
 def test_a_goal_of_one_frame_stands_under_the_last_column_and_short_rows_stay_empty() -> None:
