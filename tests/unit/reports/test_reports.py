@@ -322,6 +322,9 @@ def test_the_report_is_one_file_with_its_pictures_inside(tmp_path: Path) -> None
                  "--task &lt;x&gt;", "P &amp; Q", "a note"):
         assert part in text
     assert "nothing" not in text
+    assert "40960 imagined environment steps at 412 per second,\n9.7 minutes" in text
+    untimed = write_report(tmp_path, replace(SUMMARY, imagined_steps_per_s=float("nan"))).read_text()
+    assert "40960 imagined environment steps,\n9.7 minutes" in untimed
 
 
 def test_a_report_of_a_missing_picture_is_refused_by_name(tmp_path: Path) -> None:
