@@ -102,7 +102,9 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def opened(arguments: argparse.Namespace) -> AbstractContextManager[tuple[RunConfig, Path]]:
-    """The run folder of the options, see options.open_run."""
+    """The run folder of the options, see options.open_run. Raises ConfigError for options that do not go together."""
+    if arguments.from_scratch and arguments.model_dir:
+        raise ConfigError("--from-scratch trains a world model, and --model-dir names one; give one of them")
     starter = Starter("train-policy", _load, FIXED, FREE, options.OPTION_OF, prefix="--")
     return options.open_run(
         arguments, starter, _settings(arguments), name=lambda config: config.task or "policy",
