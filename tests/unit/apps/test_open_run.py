@@ -121,6 +121,15 @@ def test_loop_2_goes_on_with_its_recordings_and_rewards(tmp_path: Path) -> None:
     assert "is a run of 'train-video-model', not of 'train-policy'" in refused(run)
 
 
+def test_a_weight_that_is_given_by_name_is_mixed_into_the_reward_that_is_named(tmp_path: Path) -> None:
+    run, reward = ["--run-dir", tmp_path / "run"], ["--reward", "reference", "--rewards.scenery", "-10"]
+    _, config = opened([*reward, *run], train_video_model)
+    assert yaml.safe_load(config)["rewards"] == {"tracking": 1.0, "scenery": -10}
+    assert opened([*reward, *run], train_video_model)[1] == config
+    with pytest.raises(ValueError, match="--reward and --rewards both say"):
+        opened(["--reward", "agent", "--rewards", "{tracking: 1}", *run], train_video_model)
+
+
 def model_in(folder: Path, text: str = "{}") -> Path:
     folder.mkdir()
     (folder / "manifest.json").write_text(text)

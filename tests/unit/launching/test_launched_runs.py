@@ -158,6 +158,9 @@ def test_loop_2_goes_on_with_its_own_settings(tmp_path: Path, model: str) -> Non
     assert "context_bags is '/a,/b'" in refused("world_model_rl", {**run_in(tmp_path), "context_bags": "/a"})
     assert "judge is [] in this run" in refused("world_model_rl", {**run_in(tmp_path), "judge": "http://a/v1"})
     assert "unknown setting 'iterations'" in refused("evaluate", run_in(tmp_path))
+    weighed = {**begun, "rewards.closeness": "0.5", "run_dir": str(tmp_path / "weighed")}
+    launch_arguments.begin("world_model_rl", weighed)
+    assert load_video_config(str(tmp_path / "weighed" / "config.yaml")).rewards == {"agent": 1.0, "closeness": 0.5}
 
 
 def test_a_graph_that_a_command_started_goes_on_by_its_launch_file_too(tmp_path: Path, model: str) -> None:
