@@ -182,6 +182,12 @@ def test_what_cannot_be_shown_is_refused_in_one_line(tmp_path: Path, capsys: pyt
             assert text.startswith("error: ") and text.count("\n") == 1 and said in text
 
 
+def test_a_round_that_is_the_working_folder_is_of_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "rounds" / "2").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "rounds" / "2")
+    assert RunFolder(Path(".")).path == tmp_path
+
+
 def test_a_folder_that_is_no_run_is_counted_and_the_rest_is_shown(tmp_path: Path) -> None:
     (tmp_path / "rounds" / "last").mkdir(parents=True)
     (tmp_path / "config.yaml").write_text("reward: {success_threshold: 0.9}\nppo: 3\n")
