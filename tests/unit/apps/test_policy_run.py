@@ -1,6 +1,7 @@
 """What a resumed run finds: kept evaluations, shares of the updates, joined metrics."""
 
 import json
+import shlex
 from contextlib import closing, nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wm_nodes.apps import policy_run
+from wm_nodes.apps import policy_run, train_policy
 from wm_nodes.apps.policy_run import RunContext, TrainingStart, WaitingGraph, cached_success, is_trained, train_round
 from wm_nodes.config.load import load_config
 from wm_nodes.policy_rl.model_refresh import round_config, split_updates
@@ -78,8 +79,21 @@ def test_a_training_whose_policy_was_still_to_be_measured_is_not_made_again(
     trained = train_round(job, start)
     assert operator.trainings == 1, "the meter has ended it, and more updates may follow no more"
     assert (trained.bag, trained.stopped) == ("first", "the meter says so")
-    assert trained.samples_per_s > 0
+    assert trained.samples_per_s > 0 and not trained.resumed
     assert is_trained(start) and train_round(job, start) == trained
+
+
+def test_the_command_that_trains_again_names_the_model_and_a_bag_of_a_part_is_told(tmp_path: Path) -> None:
+    operator: Any = Operator(tmp_path)
+    operator.write(1)
+    said: Any = lambda text: None  # noqa: E731
+    config, starts = load_config("smoke"), tmp_path / "starts"
+    job, weak = RunContext(config, tmp_path, starts, said), tmp_path / "weak.safetensors"
+    start = TrainingStart(tmp_path, tmp_path / "model", weak, config, starts)
+    assert policy_run._make_updates(operator, job, start, "bag").resumed
+    words = shlex.split(train_policy._replay(tmp_path / "a run", "/a run/bag", tmp_path / "own model", weak))
+    given = dict(word.split(":=") for word in words[2:])
+    assert given["model_dir"] == str(tmp_path / "own model") and given["preset"] == str(tmp_path / "a run/config.yaml")
 
 
 def test_the_updates_are_split_over_the_rounds_remainder_first() -> None:

@@ -323,6 +323,9 @@ def test_the_report_is_one_file_with_its_pictures_inside(tmp_path: Path) -> None
         assert part in text
     assert "nothing" not in text
     assert "40960 imagined environment steps at 412 per second,\n9.7 minutes" in text
+    assert "Play the bag" not in text
+    again = write_report(tmp_path, SUMMARY, again="replay 'bag_uri:=/a b'").read_text()
+    assert "Play the bag" in again and "<pre>replay &#39;bag_uri:=/a b&#39;</pre>" in again
     untimed = write_report(tmp_path, replace(SUMMARY, imagined_steps_per_s=float("nan"))).read_text()
     assert "40960 imagined environment steps,\n9.7 minutes" in untimed
 
@@ -346,6 +349,8 @@ def test_the_report_of_loop_2_shows_scores_alarms_and_how_to_do_it_again(tmp_pat
     write_summary(tmp_path, CLIPS)
     values = read_summary(tmp_path)
     assert values["scores"]["tracking"]["after"] == 0.6 and values["minutes"] is None
+    (spaced := tmp_path / "a run").mkdir()
+    assert f"retrain &#39;{spaced}&#39;" in write_clip_report(spaced, CLIPS).read_text()
     quiet = write_clip_report(tmp_path, replace(CLIPS, hacked=())).read_text()
     assert "No alarm in 3 held-out evaluations of task done at the end, outcome score" in quiet
 

@@ -61,6 +61,8 @@ class ModelRefreshLoop:
     """A row for each round, as in summary.json; empty where there was one round only."""
     stopped: tuple[str, ...] = ()
     """Why rounds ended before all their updates."""
+    bag_is_whole: bool = True
+    """Whether `bag` holds every update that the policy has had."""
 
 
 def round_start(job: RunContext, number: int, model_dir: Path, policy: Path) -> TrainingStart:
@@ -112,6 +114,7 @@ def run_rounds(
             f"{start.label}: {trained.stopped}".removeprefix(": ")
             for start, trained in zip(starts, trainings, strict=True) if trained.stopped
         ),
+        len(trainings) == 1 and not trainings[0].resumed,
     )
 
 

@@ -114,6 +114,8 @@ class TrainingResult:
     """Recording of the training."""
     stopped: str = ""
     """Why training ended before all updates; else empty."""
+    resumed: bool = False
+    """Whether a call before made some of the updates, which `bag` then does not hold."""
 
     def policy(self, folder: Path) -> Path:
         return folder / POLICY_FILES.uri(self.version)
@@ -193,7 +195,8 @@ def _make_updates(operator: GraphClient, job: RunContext, start: TrainingStart, 
     after, seconds = _progress(start.folder), time.monotonic() - began
     samples = int(after["samples"]) - int(before["samples"])
     version, updates, total = (int(after[name]) for name in ("version", "updates", "samples"))
-    return TrainingResult(version, updates, total, samples / seconds if samples else math.nan, bag, stopped)
+    speed = samples / seconds if samples else math.nan
+    return TrainingResult(version, updates, total, speed, bag, stopped, resumed=before["updates"] > 0)
 
 
 def read_success(folder: Path, name: str) -> BoolArray:

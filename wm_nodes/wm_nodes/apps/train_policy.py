@@ -6,6 +6,7 @@ Every stage leaves its files in the run folder and is skipped when they are ther
 
 import argparse
 import json
+import shlex
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import asdict
@@ -150,7 +151,8 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
     write_summary(run_dir, summary)
     policy = load_policy(config, found.model_dir, found.policy)
     pictures = write_pictures(run_dir, config, found.model_dir, policy, HELDOUT.first)
-    report = write_report(run_dir, summary, pictures, config_text=dump_config(config))
+    again = _replay(run_dir, summary.bag, found.model_dir, weak) if found.bag_is_whole else ""
+    report = write_report(run_dir, summary, pictures, config_text=dump_config(config), again=again)
     if summary.rounds:
         console.print(rounds_table(summary))
     if summary.exploit_meter:
@@ -160,6 +162,15 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
     console.print(results_table(summary))
     console.print(f"acceptance of the model: {acceptance_outcome(summary.acceptance)}")
     console.print(f"report   {report}\nsummary  {run_dir / 'summary.json'}\nbag      {summary.bag}", highlight=False)
+
+
+def _replay(run_dir: Path, bag: str, model_dir: Path, weak: Path) -> str:
+    """The command that trains from a bag."""
+    values = {
+        "bag_uri": bag, "preset": run_dir / "config.yaml", "model_dir": model_dir, "initial_policy": weak, "rate": 100,
+    }
+    program = ["python3", "launch_scripts/replay_offline.launch.py"]
+    return shlex.join([*program, *(f"{name}:={value}" for name, value in values.items())])
 
 
 def _paired(before: BoolArray | None, after: BoolArray | None) -> dict[str, Any]:
