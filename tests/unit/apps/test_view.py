@@ -162,6 +162,9 @@ def test_a_run_folder_is_shown_from_its_files_also_while_they_grow(tmp_path: Pat
         assert "push_cube" in opened.js("document.title")
         metrics.write("ppo", 3, {"success_rate": 0.9})
         opened.until("document.querySelectorAll('#charts circle.imagined').length === 3 + 2")
+        beyond = """[...document.querySelectorAll('#charts circle')].filter(
+            (circle) => circle.getAttribute('cx') > circle.ownerSVGElement.viewBox.baseVal.width - 8).length"""
+        assert opened.js(beyond) == 0, "more updates than the settings say are inside of the axes, too"
         assert_no_complaints(opened)
     opened.until("document.getElementById('state').textContent.startsWith('not connected')")
 
