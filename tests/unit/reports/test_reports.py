@@ -28,6 +28,7 @@ from wm_nodes.reports.curves import Panel, curves, read_series
 from wm_nodes.reports.film_strip import STEP_MS, film_strip, moving_picture
 from wm_nodes.reports.html import Picture, write_report
 from wm_nodes.reports.machine import machine_facts
+from wm_nodes.reports.stages import Stages, say_files
 from wm_nodes.reports.summary import (
     FILE_NAME,
     SuccessRate,
@@ -393,6 +394,15 @@ def test_a_series_of_a_section_leaves_out_the_others_and_panels_without_numbers_
         drawn = curves(path, tmp_path / "curves.png", panels, step="buffers")
         assert drawn is not None and cv2.imread(str(drawn)).shape[0] == 297 * rows, "panels without a number"
     assert curves(path, tmp_path / "none.png", clip_panels(2)[4:]) is None
+
+
+def test_paths_are_printed_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "runs[old]" / ("long " * 20)
+    Stages()(f"run folder {folder.parent}")
+    say_files(folder / "report.html", folder / "summary.json", str(folder / "bags[/b]"))
+    first, *files = capsys.readouterr().out.splitlines()
+    assert "runs[old]" in first
+    assert files == [f"report   {folder}/report.html", f"summary  {folder}/summary.json", f"bag      {folder}/bags[/b]"]
 
 
 def test_machine_facts_name_date_processor_and_versions() -> None:

@@ -44,7 +44,7 @@ from wm_nodes.policy_rl.validation.exploit_meter import start_seeds
 from wm_nodes.recording import read_spec
 from wm_nodes.reports.html import write_report
 from wm_nodes.reports.machine import machine_facts
-from wm_nodes.reports.stages import Stages, console
+from wm_nodes.reports.stages import Stages, console, say_files
 from wm_nodes.reports.summary import Summary, acceptance_outcome, as_first_made, read_readings, write_summary
 from wm_nodes.reports.tables import exploit_table, results_table, rounds_table, tasks_table
 from wm_nodes.training.run_record import Starter
@@ -161,7 +161,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
         console.print(tasks_table(summary))
     console.print(results_table(summary))
     console.print(f"acceptance of the model: {acceptance_outcome(summary.acceptance)}")
-    console.print(f"report   {report}\nsummary  {run_dir / 'summary.json'}\nbag      {summary.bag}", highlight=False)
+    say_files(report, run_dir / "summary.json", summary.bag)
 
 
 def _replay(run_dir: Path, bag: str, model_dir: Path, weak: Path) -> str:
@@ -282,7 +282,7 @@ def _check_meter(config: RunConfig, starts: Path, stage: Stages) -> None:
     try:
         start_seeds(config, starts)
     except ValueError as error:
-        stage(f"[yellow]the exploit meter is off[/]: {error}")
+        stage(f"the exploit meter is off: {error}")
 
 
 def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stage: Stages) -> Path:
