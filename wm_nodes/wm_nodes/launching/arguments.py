@@ -124,7 +124,7 @@ def _settings(scenario: str, given: Mapping[str, str]) -> dict[str, Any]:
     if scenario_of(scenario).loop == VIDEO and (reward := given.get("reward")):
         if reward != AGENT:
             raise GraphError(f"reward {reward!r} is of policies; for the video model give agent or nothing")
-        settings |= reward_overrides(reward)
+        settings = reward_overrides(reward) | settings  # a weight of one that is given by name wins
     return settings
 
 
