@@ -51,7 +51,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     one = command("view", _view, "write the page on which people look at clips and label them")
     one.add_argument("--round", type=int, help="only this round")
     one.add_argument("--sample", type=Path, help="only the clips that `sample` chose")
-    one.add_argument("--second", action="store_true", help="of --sample, only those for a second annotator")
+    one.add_argument("--second", action="store_true", help="only those for a second annotator")
     one.add_argument("--output", type=Path, help=f"default: {FILE_NAME} in the log's folder; pictures stay there")
     one = command("agree", _agree, "compare the verdicts with exported labels, row by row of the paper's Table 2")
     one.add_argument("--labels", type=Path, nargs="+", required=True, help="files exported by the page")
@@ -94,8 +94,6 @@ def _sample(arguments: argparse.Namespace) -> None:
 
 
 def _view(arguments: argparse.Namespace) -> None:
-    if arguments.second and not arguments.sample:
-        raise AuditError("--second needs --sample, the file that says which clips a second annotator gets")
     record = read_record(arguments.log)
     sample = read_sample(arguments.sample) if arguments.sample else None
     wanted = {clip.evaluation for clip in sample.chosen if clip.second or not arguments.second} if sample else None

@@ -217,14 +217,6 @@ def test_the_page_asks_for_nothing_from_outside() -> None:
     assert not any(word in text for word in ("innerHTML", "insertAdjacentHTML", "document.write", "eval("))
 
 
-def test_clips_for_a_second_annotator_are_those_of_a_sample(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    make_log(tmp_path / "log", 1)
-    assert main(["audit", "view", str(tmp_path / "log"), "--second"]) == 2
-    assert "--second needs --sample" in capsys.readouterr().err
-
-
 def test_a_page_may_stand_elsewhere_and_a_log_elsewhere(tmp_path: Path) -> None:
     make_log(tmp_path / "a log", 1)
     out = tmp_path / "pages" / "one.html"
