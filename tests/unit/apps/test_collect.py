@@ -82,6 +82,14 @@ def test_seeds_of_the_evaluation_are_refused(tmp_path: Path, capsys: pytest.Capt
     assert not list(tmp_path.iterdir())
 
 
+def test_a_task_without_a_name_is_refused_before_anything_is_collected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["collect", str(tmp_path), "--tasks", "push,", "--episodes", "1"]) == 2
+    assert "unknown task ''; choose one of" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_table_counts_by_the_columns_it_is_given() -> None:
     rows = [
         {"task": "push", "scene": "a", "success": True, "steps": 10, "planner": ""},

@@ -20,6 +20,16 @@ BEGINNING = ["--preset", "smoke", "--ppo.updates", "3", "--seed", "4", "--task",
              "--from-scratch", "--reward", "agent", "--judge", "http://a/v1,http://b/v1", "--judge-model", "judge",
              "--ppo.num_steps", "16", "--force"]
 
+WITH_MODEL = [word for word in BEGINNING if word != "--from-scratch"]
+
+
+@pytest.fixture
+def any_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder with a manifest is a world model that fits."""
+    for name in ("check_model", "model_spec", "read_world_manifest"):
+        monkeypatch.setattr(train_policy, name, lambda *_: None)
+    monkeypatch.setattr(train_policy, "with_reader", lambda config, folder: config)
+
 
 def opened(words: Sequence[object], app: ModuleType = train_policy) -> tuple[dict[str, Any], str]:
     """The options and the configuration with which a command would go on."""
@@ -39,21 +49,29 @@ def refused(words: Sequence[object], app: ModuleType = train_policy) -> str:
     return str(caught.value)
 
 
+@pytest.mark.usefixtures("any_model")
 def test_the_folder_alone_brings_back_every_option_that_decides_the_run(tmp_path: Path) -> None:
     run = ["--run-dir", tmp_path / "run"]
     model = tmp_path / "model"
     model.mkdir()
     (model / "manifest.json").touch()
-    begun, config = opened([*BEGINNING, "--model-dir", model, *run])
+    begun, config = opened([*WITH_MODEL, "--model-dir", model, *run])
     again, same = opened(run)
     assert same == config
     names = ("preset", "model_dir", "from_scratch", "reward", "force", "compose")
     assert {name: again[name] for name in names} == {name: begun[name] for name in names} == {
-        "preset": "smoke", "model_dir": str(model), "from_scratch": True, "reward": "agent", "force": True,
+        "preset": "smoke", "model_dir": str(model), "from_scratch": False, "reward": "agent", "force": True,
         "compose": False,
     }
-    assert opened([*BEGINNING, "--model-dir", model, *run])[1] == config, "options that are equal pass"
+    assert opened([*WITH_MODEL, "--model-dir", model, *run])[1] == config, "options that are equal pass"
     assert opened(["--preset", "smoke", "--ppo.updates", "3", *run])[1] == config
+
+
+def test_options_of_which_one_would_be_ignored_are_refused(tmp_path: Path) -> None:
+    run = ["--run-dir", tmp_path / "run"]
+    assert "give one of them" in refused([*BEGINNING, "--model-dir", model_in(tmp_path / "model"), *run])
+    assert not (tmp_path / "run").exists()
+    assert opened([*BEGINNING, *run])[0]["from_scratch"] and opened(run)[0]["from_scratch"]
 
 
 def test_each_option_that_differs_is_named_with_both_values_and_the_remedy(tmp_path: Path) -> None:
@@ -103,15 +121,25 @@ def test_loop_2_goes_on_with_its_recordings_and_rewards(tmp_path: Path) -> None:
     assert "is a run of 'train-video-model', not of 'train-policy'" in refused(run)
 
 
+def test_a_weight_that_is_given_by_name_is_mixed_into_the_reward_that_is_named(tmp_path: Path) -> None:
+    run, reward = ["--run-dir", tmp_path / "run"], ["--reward", "reference", "--rewards.scenery", "-10"]
+    _, config = opened([*reward, *run], train_video_model)
+    assert yaml.safe_load(config)["rewards"] == {"tracking": 1.0, "scenery": -10}
+    assert opened([*reward, *run], train_video_model)[1] == config
+    with pytest.raises(ValueError, match="--reward and --rewards both say"):
+        opened(["--reward", "agent", "--rewards", "{tracking: 1}", *run], train_video_model)
+
+
 def model_in(folder: Path, text: str = "{}") -> Path:
     folder.mkdir()
     (folder / "manifest.json").write_text(text)
     return folder
 
 
+@pytest.mark.usefixtures("any_model")
 def test_a_moved_model_is_given_anew_and_another_one_refused(tmp_path: Path) -> None:
     run, model = ["--run-dir", tmp_path / "run"], model_in(tmp_path / "model")
-    _, config = opened([*BEGINNING, "--model-dir", model, *run])
+    _, config = opened([*WITH_MODEL, "--model-dir", model, *run])
     moved, other = model.rename(tmp_path / "moved"), model_in(tmp_path / "other", '{"sha256": {}}')
     assert f"{model} holds no manifest.json; name the folder of a trained world model with --model-dir" in refused(run)
     text = refused(["--model-dir", other, *run])
@@ -124,9 +152,10 @@ def test_a_moved_model_is_given_anew_and_another_one_refused(tmp_path: Path) -> 
     assert opened(["--model-dir", model, *run])[0]["model_dir"] == str(moved), "a link is what it leads to"
 
 
+@pytest.mark.usefixtures("any_model")
 def test_a_record_without_contents_goes_on_where_the_old_path_leads_to_what_was_moved(tmp_path: Path) -> None:
     run, model = ["--run-dir", tmp_path / "run"], model_in(tmp_path / "model")
-    opened([*BEGINNING, "--model-dir", model, *run])
+    opened([*WITH_MODEL, "--model-dir", model, *run])
     file = tmp_path / "run" / "config.yaml"
     values = yaml.safe_load(file.read_text())
     assert set(values["run"].pop("contents")) == {str(model)}

@@ -162,6 +162,9 @@ def test_a_run_folder_is_shown_from_its_files_also_while_they_grow(tmp_path: Pat
         assert "push_cube" in opened.js("document.title")
         metrics.write("ppo", 3, {"success_rate": 0.9})
         opened.until("document.querySelectorAll('#charts circle.imagined').length === 3 + 2")
+        beyond = """[...document.querySelectorAll('#charts circle')].filter(
+            (circle) => circle.getAttribute('cx') > circle.ownerSVGElement.viewBox.baseVal.width - 8).length"""
+        assert opened.js(beyond) == 0, "more updates than the settings say are inside of the axes, too"
         assert_no_complaints(opened)
     opened.until("document.getElementById('state').textContent.startsWith('not connected')")
 
@@ -180,6 +183,12 @@ def test_what_cannot_be_shown_is_refused_in_one_line(tmp_path: Path, capsys: pyt
             assert main(["view", *words]) == 2
             text = capsys.readouterr().err
             assert text.startswith("error: ") and text.count("\n") == 1 and said in text
+
+
+def test_a_round_that_is_the_working_folder_is_of_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "rounds" / "2").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "rounds" / "2")
+    assert RunFolder(Path(".")).path == tmp_path
 
 
 def test_a_folder_that_is_no_run_is_counted_and_the_rest_is_shown(tmp_path: Path) -> None:

@@ -52,7 +52,8 @@ def given(tmp_path: Path) -> dict[str, str]:
 
 
 def of(scenario: str, given: dict[str, str]) -> dict[str, str]:
-    return {name: value for name, value in given.items() if name in SCENARIOS[scenario].arguments}
+    left_out = () if SCENARIOS[scenario].loop == "video" else ("video_model_dir",)
+    return {name: given[name] for name in given if name in {*SCENARIOS[scenario].arguments} - {*left_out}}
 
 
 def labels(scenario: str, given: dict[str, str], **more: str) -> list[str]:
@@ -157,7 +158,7 @@ def test_the_learner_knows_what_is_imagined_from_for_its_exploit_meter(given: di
 
     starts = str(Path(given["model_dir"]) / "starts.safetensors")
     assert learner()["starts_file"] == starts and "video_model_dir" not in learner()
-    video = learner(backend="video_model")
+    video = learner(backend="video_model", video_model_dir=given["video_model_dir"])
     assert (video["starts_file"], video["video_model_dir"]) == (starts, given["video_model_dir"])
     assert "starts_file" not in learner(backend="environment")
 
@@ -176,6 +177,8 @@ def test_learner_of_several_ranks_is_not_composed(given: dict[str, str]) -> None
         ({"num_envs": "many"}, "num_envs must be a whole number, got 'many'"),
         ({"domain_id": "102"}, "domain_id must be 0 to 101, got 102"),
         ({"model_dir": "/nowhere"}, "holds no manifest.json"),
+        ({"video_model_dir": "/trained"}, "video_model_dir would change nothing without backend:=video_model"),
+        ({"view_port": "8080"}, "view_port would change nothing without view:=page"),
     ],
 )
 def test_bad_arguments_are_named(wrong: dict[str, str], message: str, given: dict[str, str]) -> None:

@@ -58,13 +58,17 @@ def test_the_folder_alone_brings_back_settings_and_arguments(
 def test_a_run_that_was_moved_goes_on_with_its_own_files(tmp_path: Path, model: str) -> None:
     run, moved = tmp_path / "run", tmp_path / "moved"
     inside = {"initial_policy": "policies/weak.safetensors", "starts_file": "starts.safetensors"}
-    begun = {"preset": "smoke", "model_dir": model, **{name: str(run / file) for name, file in inside.items()}}
+    elsewhere = f"{tmp_path}/mount{run}/first_frames.safetensors"
+    begun = {"preset": "smoke", "model_dir": model, "first_frames_file": elsewhere}
+    begun |= {name: str(run / file) for name, file in inside.items()}
     _, values = launch_arguments.begin("online_training", {**run_in(tmp_path), **begun})
     run.rename(moved)
     _, again = launch_arguments.begin("online_training", {"run_dir": str(moved)})
     assert {name: again[name] for name in inside} == {name: str(moved / file) for name, file in inside.items()}
     assert again["bag_uri"] == str(moved / Path(values["bag_uri"]).relative_to(run)) and again["model_dir"] == model
-    assert str(run) + "/" not in (moved / "config.yaml").read_text(encoding="utf-8")
+    assert again["first_frames_file"] == elsewhere, "only the run's own folder has moved"
+    record = (moved / "config.yaml").read_text(encoding="utf-8")
+    assert f"{run}/" not in record.replace(elsewhere, "")
 
 
 def test_files_that_were_moved_are_given_anew_and_others_refused(tmp_path: Path, model: str) -> None:
@@ -158,6 +162,9 @@ def test_loop_2_goes_on_with_its_own_settings(tmp_path: Path, model: str) -> Non
     assert "context_bags is '/a,/b'" in refused("world_model_rl", {**run_in(tmp_path), "context_bags": "/a"})
     assert "judge is [] in this run" in refused("world_model_rl", {**run_in(tmp_path), "judge": "http://a/v1"})
     assert "unknown setting 'iterations'" in refused("evaluate", run_in(tmp_path))
+    weighed = {**begun, "rewards.closeness": "0.5", "run_dir": str(tmp_path / "weighed")}
+    launch_arguments.begin("world_model_rl", weighed)
+    assert load_video_config(str(tmp_path / "weighed" / "config.yaml")).rewards == {"agent": 1.0, "closeness": 0.5}
 
 
 def test_a_graph_that_a_command_started_goes_on_by_its_launch_file_too(tmp_path: Path, model: str) -> None:

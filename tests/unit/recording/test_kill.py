@@ -191,6 +191,12 @@ def test_a_flipped_byte_is_noticed_and_costs_only_its_chunk(tmp_path: Path) -> N
     assert len(list(read_episodes(report.bag))) == 5
 
 
+def test_the_working_folder_is_a_bag_like_any_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(write_episodes(tmp_path / "bag", 2))
+    assert len(list(read_episodes(Path(".")))) == 2
+    assert recover(Path(".")).bag == tmp_path / "bag_recovered"
+
+
 def test_an_unfinished_recording_blocks_its_name_until_dealt_with(tmp_path: Path) -> None:
     spec = make_spec()
     with pytest.raises(ValueError, match="no steps"):

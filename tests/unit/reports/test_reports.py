@@ -28,6 +28,7 @@ from wm_nodes.reports.curves import Panel, curves, read_series
 from wm_nodes.reports.film_strip import STEP_MS, film_strip, moving_picture
 from wm_nodes.reports.html import Picture, write_report
 from wm_nodes.reports.machine import machine_facts
+from wm_nodes.reports.stages import Stages, say_files
 from wm_nodes.reports.summary import (
     FILE_NAME,
     SuccessRate,
@@ -117,9 +118,13 @@ def test_a_run_of_several_tasks_shows_the_real_success_of_each(tmp_path: Path) -
     assert "Real success by task" not in write_report(tmp_path, SUMMARY, [], config_text="").read_text()
 
 
-def test_a_marked_step_is_shown_and_framed_in_green() -> None:
-    picture = film_strip({"real": frames(17, 40)}, scale=4, max_columns=5, marks={"real": 7})
-    assert blocks_of(picture, (47, 40, 40)) and blocks_of(picture, (30, 170, 80))
+@pytest.mark.parametrize("others", [{}, {"imagined": 8}, {"imagined": 6}, {"imagined": 1}])
+def test_a_marked_step_is_shown_and_framed_in_green(others: dict[str, int]) -> None:
+    rows = {"real": frames(17, 40)} | {name: frames(17, 90) for name in others}
+    picture = film_strip(rows, scale=4, max_columns=5, marks={"real": 7, **others})
+    assert blocks_of(picture, (47, 40, 40)), "the step of the first row is shown"
+    one = blocks_of(film_strip({"real": frames(17, 40)}, scale=4, marks={"real": 7}), (30, 170, 80))
+    assert one and blocks_of(picture, (30, 170, 80)) == one * len(rows)
 
 
 def test_a_goal_of_one_frame_stands_under_the_last_column_and_short_rows_stay_empty() -> None:
@@ -318,6 +323,12 @@ def test_the_report_is_one_file_with_its_pictures_inside(tmp_path: Path) -> None
                  "--task &lt;x&gt;", "P &amp; Q", "a note"):
         assert part in text
     assert "nothing" not in text
+    assert "40960 imagined environment steps at 412 per second,\n9.7 minutes" in text
+    assert "Play the bag" not in text
+    again = write_report(tmp_path, SUMMARY, again="replay 'bag_uri:=/a b'").read_text()
+    assert "Play the bag" in again and "<pre>replay &#39;bag_uri:=/a b&#39;</pre>" in again
+    untimed = write_report(tmp_path, replace(SUMMARY, imagined_steps_per_s=float("nan"))).read_text()
+    assert "40960 imagined environment steps,\n9.7 minutes" in untimed
 
 
 def test_a_report_of_a_missing_picture_is_refused_by_name(tmp_path: Path) -> None:
@@ -339,6 +350,8 @@ def test_the_report_of_loop_2_shows_scores_alarms_and_how_to_do_it_again(tmp_pat
     write_summary(tmp_path, CLIPS)
     values = read_summary(tmp_path)
     assert values["scores"]["tracking"]["after"] == 0.6 and values["minutes"] is None
+    (spaced := tmp_path / "a run").mkdir()
+    assert f"retrain &#39;{spaced}&#39;" in write_clip_report(spaced, CLIPS).read_text()
     quiet = write_clip_report(tmp_path, replace(CLIPS, hacked=())).read_text()
     assert "No alarm in 3 held-out evaluations of task done at the end, outcome score" in quiet
 
@@ -381,6 +394,15 @@ def test_a_series_of_a_section_leaves_out_the_others_and_panels_without_numbers_
         drawn = curves(path, tmp_path / "curves.png", panels, step="buffers")
         assert drawn is not None and cv2.imread(str(drawn)).shape[0] == 297 * rows, "panels without a number"
     assert curves(path, tmp_path / "none.png", clip_panels(2)[4:]) is None
+
+
+def test_paths_are_printed_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "runs[old]" / ("long " * 20)
+    Stages()(f"run folder {folder.parent}")
+    say_files(folder / "report.html", folder / "summary.json", str(folder / "bags[/b]"))
+    first, *files = capsys.readouterr().out.splitlines()
+    assert "runs[old]" in first
+    assert files == [f"report   {folder}/report.html", f"summary  {folder}/summary.json", f"bag      {folder}/bags[/b]"]
 
 
 def test_machine_facts_name_date_processor_and_versions() -> None:

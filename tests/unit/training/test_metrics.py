@@ -25,12 +25,15 @@ def test_values_that_are_not_finite_are_null_in_valid_json(tmp_path: Path) -> No
     assert line == {"section": "ppo", "step": 1, "a": None, "b": None, "c": 0.0}
 
 
-def test_a_line_cut_by_a_crash_is_left_out(tmp_path: Path) -> None:
+def test_a_line_cut_by_a_crash_is_left_out_and_takes_no_other_with_it(tmp_path: Path) -> None:
     with closing(MetricsWriter(tmp_path, tensorboard=False)) as writer:
         writer.write("ppo", 1, {"loss": 0.5})
     with open(tmp_path / FILE_NAME, "a") as file:
         file.write('{"section": "ppo", "st')
     assert len(read_metrics(tmp_path)) == 1
+    with closing(MetricsWriter(tmp_path, tensorboard=False)) as writer:
+        writer.write("ppo", 2, {"loss": 0.25})
+    assert [line["loss"] for line in read_metrics(tmp_path)] == [0.5, 0.25]
 
 
 def test_tensorboard_holds_the_same_scalars(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """A run folder has one writer: real processes take it, lose it, and are told who holds it."""
 
+import errno
 import json
 import os
 import signal
@@ -155,6 +156,21 @@ def test_a_folder_that_only_the_lock_has_made_goes_with_it(tmp_path: Path) -> No
     with RunLock(made), RunLock(used):
         (used / "config.yaml").touch()
     assert not made.exists() and [path.name for path in used.iterdir()] == ["config.yaml"]
+
+
+def test_a_folder_in_which_nothing_may_be_written_is_named_as_such(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.open
+
+    def opened(path: Any, flags: int, mode: int = 0o777) -> int:
+        if flags & os.O_CREAT:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return real(path, flags, mode)
+
+    monkeypatch.setattr(os, "open", opened)
+    with pytest.raises(PermissionError, match=f"Permission denied: '{tmp_path / NAME}'"):
+        RunLock(tmp_path).acquire()
 
 
 def test_a_lock_file_that_a_person_deleted_is_no_trouble(tmp_path: Path) -> None:

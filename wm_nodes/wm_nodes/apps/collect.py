@@ -13,7 +13,7 @@ from pathlib import Path
 from wm_nodes.apps.options import add_preset, positive, settings
 from wm_nodes.config.load import load_config
 from wm_nodes.config.seed_ranges import EVALUATION
-from wm_nodes.config.tasks import task_names
+from wm_nodes.config.tasks import check_task, task_names
 from wm_nodes.core.files import write_atomic
 from wm_nodes.environments.record import collect_plan, keep_plan, read_index, success_table, task_plan
 
@@ -29,7 +29,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Collect one task after the other and print the successes by behaviour."""
     chosen = {task: load_config(arguments.preset, {**settings(arguments), "task": task})
-              for task in arguments.tasks.split(",")}
+              for task in map(check_task, arguments.tasks.split(","))}
     bags = list[Path]()
     for task, config in chosen.items():
         if not 0 <= arguments.first_seed <= EVALUATION.first - arguments.episodes:

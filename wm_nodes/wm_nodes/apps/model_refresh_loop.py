@@ -8,6 +8,7 @@ ppo.kl_reference_weight keeps it close to, which is the one the round started fr
 """
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -53,13 +54,15 @@ class ModelRefreshLoop:
     samples: int
     """Transitions of all rounds."""
     samples_per_s: float
-    """Mean of the rounds."""
+    """Mean of the rounds that were timed; NaN where none was."""
     bag: str
     """Of the last round's training."""
     table: tuple[dict[str, Any], ...]
     """A row for each round, as in summary.json; empty where there was one round only."""
     stopped: tuple[str, ...] = ()
     """Why rounds ended before all their updates."""
+    bag_is_whole: bool = True
+    """Whether `bag` holds every update that the policy has had."""
 
 
 def round_start(job: RunContext, number: int, model_dir: Path, policy: Path) -> TrainingStart:
@@ -97,6 +100,7 @@ def run_rounds(
 
     model_refresh.run_rounds(job.config, job.run_dir, model_dir, job.starts, train)
     first, last = starts[0], starts[-1]
+    speeds = [trained.samples_per_s for trained in trainings if math.isfinite(trained.samples_per_s)]
     if table:
         join_metrics([start.folder for start in starts], job.run_dir)
     return ModelRefreshLoop(
@@ -105,11 +109,12 @@ def run_rounds(
         read_success(last.folder, "real_after") if job.measures else None,
         read_success(first.folder, "imagined_before"), read_success(last.folder, "imagined_after"),
         sum(trained.samples for trained in trainings),
-        sum(trained.samples_per_s for trained in trainings) / len(trainings), trainings[-1].bag, tuple(table),
+        sum(speeds) / len(speeds) if speeds else math.nan, trainings[-1].bag, tuple(table),
         tuple(
             f"{start.label}: {trained.stopped}".removeprefix(": ")
             for start, trained in zip(starts, trainings, strict=True) if trained.stopped
         ),
+        len(trainings) == 1 and not trainings[0].resumed,
     )
 
 

@@ -5,6 +5,7 @@ goes on where it stopped, and never takes a trained policy for the one it began 
 """
 
 import json
+import math
 import os
 import sys
 import time
@@ -108,11 +109,13 @@ class TrainingResult:
     samples: int
     """Transitions trained on."""
     samples_per_s: float
-    """Of the last uninterrupted part."""
+    """Of the last uninterrupted part; NaN where that made no update."""
     bag: str
     """Recording of the training."""
     stopped: str = ""
     """Why training ended before all updates; else empty."""
+    resumed: bool = False
+    """Whether a call before made some of the updates, which `bag` then does not hold."""
 
     def policy(self, folder: Path) -> Path:
         return folder / POLICY_FILES.uri(self.version)
@@ -144,7 +147,10 @@ def start_graph(job: RunContext, start: TrainingStart) -> WaitingGraph:
 
 
 def is_trained(start: TrainingStart) -> bool:
-    return (start.folder / TRAINED).is_file()
+    """Whether the training is made and, where policies are measured in an environment, its policy is."""
+    measures = start.config.evaluation.environment != NO_ENVIRONMENT
+    measured = not measures or _evaluation(start.folder, "real_after").is_file()
+    return measured and (start.folder / TRAINED).is_file()
 
 
 def train_round(
@@ -158,36 +164,49 @@ def train_round(
     waiting: this training's processes, where they run already; stopped at the end.
     """
     marker = start.folder / TRAINED
-    if is_trained(start):
+    trained = TrainingResult(**read_json(marker, AGAIN)) if marker.is_file() else None
+    if trained is not None:
         job.stage(f"{start.label or 'training'} is done already ({marker})")
-        return TrainingResult(**read_json(marker, AGAIN))
+        if is_trained(start):
+            return trained
     waiting = waiting or start_graph(job, start)
     with closing(waiting.runner) as runner:
         runner.activate(READY_S)
         os.environ.update(runner.environment)
         with GraphClient(alive=runner.check) as operator:
-            if judge is not None:
-                judge(_real(operator, job, start, "before", start.policy) if job.measures else None)
-            before, began = _progress(start.folder), time.monotonic()
-            remaining = max(0, start.config.ppo.updates - int(before["updates"]))
-            job.stage(f"training the policy in the {job.trained_in}: {remaining} updates")
-            stopped = _train(operator, remaining) if remaining else ""
-            if stopped:
-                job.stage(f"training ends: {stopped}")
-            after, seconds = _progress(start.folder), time.monotonic() - began
-            samples = int(after["samples"]) - int(before["samples"])
-            version, updates, total = (int(after[name]) for name in ("version", "updates", "samples"))
-            trained = TrainingResult(version, updates, total, samples / seconds, str(waiting.bag), stopped)
+            if trained is None:
+                if judge is not None:
+                    judge(_real(operator, job, start, "before", start.policy) if job.measures else None)
+                trained = _make_updates(operator, job, start, str(waiting.bag))
+                write_atomic(marker, json.dumps(asdict(trained), indent=1).encode())
             if job.measures:
                 _real(operator, job, start, "after", trained.policy(start.folder))
-    write_atomic(marker, json.dumps(asdict(trained), indent=1).encode())
     return trained
+
+
+def _make_updates(operator: GraphClient, job: RunContext, start: TrainingStart, bag: str) -> TrainingResult:
+    """Make the updates that are left."""
+    before, began = _progress(start.folder), time.monotonic()
+    remaining = max(0, start.config.ppo.updates - int(before["updates"]))
+    job.stage(f"training the policy in the {job.trained_in}: {remaining} updates")
+    stopped = _train(operator, remaining) if remaining else ""
+    if stopped:
+        job.stage(f"training ends: {stopped}")
+    after, seconds = _progress(start.folder), time.monotonic() - began
+    samples = int(after["samples"]) - int(before["samples"])
+    version, updates, total = (int(after[name]) for name in ("version", "updates", "samples"))
+    speed = samples / seconds if samples else math.nan
+    return TrainingResult(version, updates, total, speed, bag, stopped, resumed=before["updates"] > 0)
 
 
 def read_success(folder: Path, name: str) -> BoolArray:
     """A kept evaluation, (E,) in seed order. name: real_ or imagined_, then before or after."""
-    values = read_json(folder / "evaluations" / f"{name}.json", AGAIN)
+    values = read_json(_evaluation(folder, name), AGAIN)
     return np.asarray(values["success"], bool)
+
+
+def _evaluation(folder: Path, name: str) -> Path:
+    return folder / "evaluations" / f"{name}.json"
 
 
 def imagined_success(job: RunContext, folder: Path, label: str, model_dir: Path, policy: Path) -> BoolArray:
@@ -206,7 +225,7 @@ def imagined_success(job: RunContext, folder: Path, label: str, model_dir: Path,
         return evaluate(weights, env, episodes, job.config.evaluation.first_seed).success
 
     identity = {"policy_sha256": file_sha256(policy), "model_sha256": sha256}
-    success = cached_success(folder / "evaluations" / f"imagined_{label}.json", identity, measure)
+    success = cached_success(_evaluation(folder, f"imagined_{label}"), identity, measure)
     job.stage(f"imagined success of {policy.stem}: {int(success.sum())}/{len(success)}")
     return success
 
@@ -251,7 +270,7 @@ def _real(operator: GraphClient, job: RunContext, start: TrainingStart, label: s
             )
 
     identity = {"policy_sha256": file_sha256(policy)}
-    success = cached_success(start.folder / "evaluations" / f"real_{label}.json", identity, measure)
+    success = cached_success(_evaluation(start.folder, f"real_{label}"), identity, measure)
     found = success_rate(success)
     job.stage(
         f"real success {label} training: {found.successes}/{found.episodes} (95 % {found.low:.2f} to {found.high:.2f})"

@@ -73,9 +73,9 @@ def run(arguments: argparse.Namespace) -> None:
             model_from_data(data, starts, config, model, command=arguments.command, say=stage)
         report = _judge(config, model)
         stage(f"acceptance {report.words}")
-        following = f"--model-dir {model} --demos {shlex.join(map(str, arguments.bags))} --evaluation.environment none"
+        following = shlex.join(["--model-dir", str(model), "--demos", *map(str, arguments.bags)])
         for name, value in (("model", model), ("verdict", model / ACCEPTANCE),
-                            ("next", f'wm train-policy --task "" {following}')):
+                            ("next", f'wm train-policy --task "" {following} --evaluation.environment none')):
             console.print(f"{name:8} {value}", highlight=False, soft_wrap=True, markup=False)
         if report.failed:
             raise ModelNotAcceptedError(

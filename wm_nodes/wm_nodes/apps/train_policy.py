@@ -6,6 +6,7 @@ Every stage leaves its files in the run folder and is skipped when they are ther
 
 import argparse
 import json
+import shlex
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import asdict
@@ -43,7 +44,7 @@ from wm_nodes.policy_rl.validation.exploit_meter import start_seeds
 from wm_nodes.recording import read_spec
 from wm_nodes.reports.html import write_report
 from wm_nodes.reports.machine import machine_facts
-from wm_nodes.reports.stages import Stages, console
+from wm_nodes.reports.stages import Stages, console, say_files
 from wm_nodes.reports.summary import Summary, acceptance_outcome, as_first_made, read_readings, write_summary
 from wm_nodes.reports.tables import exploit_table, results_table, rounds_table, tasks_table
 from wm_nodes.training.run_record import Starter
@@ -102,7 +103,9 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def opened(arguments: argparse.Namespace) -> AbstractContextManager[tuple[RunConfig, Path]]:
-    """The run folder of the options, see options.open_run."""
+    """The run folder of the options, see options.open_run. Raises ConfigError for options that do not go together."""
+    if arguments.from_scratch and arguments.model_dir:
+        raise ConfigError("--from-scratch trains a world model, and --model-dir names one; give one of them")
     starter = Starter("train-policy", _load, FIXED, FREE, options.OPTION_OF, prefix="--")
     return options.open_run(
         arguments, starter, _settings(arguments), name=lambda config: config.task or "policy",
@@ -148,7 +151,8 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
     write_summary(run_dir, summary)
     policy = load_policy(config, found.model_dir, found.policy)
     pictures = write_pictures(run_dir, config, found.model_dir, policy, HELDOUT.first)
-    report = write_report(run_dir, summary, pictures, config_text=dump_config(config))
+    again = _replay(run_dir, summary.bag, found.model_dir, weak) if found.bag_is_whole else ""
+    report = write_report(run_dir, summary, pictures, config_text=dump_config(config), again=again)
     if summary.rounds:
         console.print(rounds_table(summary))
     if summary.exploit_meter:
@@ -157,7 +161,16 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
         console.print(tasks_table(summary))
     console.print(results_table(summary))
     console.print(f"acceptance of the model: {acceptance_outcome(summary.acceptance)}")
-    console.print(f"report   {report}\nsummary  {run_dir / 'summary.json'}\nbag      {summary.bag}", highlight=False)
+    say_files(report, run_dir / "summary.json", summary.bag)
+
+
+def _replay(run_dir: Path, bag: str, model_dir: Path, weak: Path) -> str:
+    """The command that trains from a bag."""
+    values = {
+        "bag_uri": bag, "preset": run_dir / "config.yaml", "model_dir": model_dir, "initial_policy": weak, "rate": 100,
+    }
+    program = ["python3", "launch_scripts/replay_offline.launch.py"]
+    return shlex.join([*program, *(f"{name}:={value}" for name, value in values.items())])
 
 
 def _paired(before: BoolArray | None, after: BoolArray | None) -> dict[str, Any]:
@@ -269,7 +282,7 @@ def _check_meter(config: RunConfig, starts: Path, stage: Stages) -> None:
     try:
         start_seeds(config, starts)
     except ValueError as error:
-        stage(f"[yellow]the exploit meter is off[/]: {error}")
+        stage(f"the exploit meter is off: {error}")
 
 
 def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stage: Stages) -> Path:

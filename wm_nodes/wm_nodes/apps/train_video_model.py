@@ -96,7 +96,7 @@ def opened(arguments: argparse.Namespace) -> AbstractContextManager[tuple[VideoR
     """The run folder of the options, see options.open_run. Raises ValueError for options that do not go together."""
     _check_options(arguments)
     starter = Starter("train-video-model", _load, FIXED, FREE, options.OPTION_OF, prefix="--")
-    settings = options.settings(arguments) | reward_overrides(arguments.reward) | options.judge_settings(arguments)
+    settings = reward_overrides(arguments.reward) | options.settings(arguments) | options.judge_settings(arguments)
     return options.open_run(arguments, starter, settings, name=lambda config: "world_model_rl", check=_check)
 
 
@@ -193,6 +193,8 @@ def _post_train(
 def _check_options(arguments: argparse.Namespace) -> None:
     if arguments.keep_buffers is not None and arguments.keep_buffers < 1:
         raise ValueError(f"--keep-buffers must be at least 1, got {arguments.keep_buffers}")
+    if arguments.reward and "rewards" in arguments.settings:
+        raise ValueError("--reward and --rewards both say all that pays; give one of them, or --rewards.NAME beside it")
     if bool(arguments.bags) != bool(arguments.heldout_bags):
         raise ValueError("--bags and --heldout-bags go together: what is trained on, and what is held out")
     if missing := [bag for bag in (*arguments.bags, *arguments.heldout_bags) if not bag.is_dir()]:

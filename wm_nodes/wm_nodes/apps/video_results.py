@@ -26,7 +26,7 @@ from wm_nodes.reports.curves import curves
 from wm_nodes.reports.film_strip import film_strip
 from wm_nodes.reports.html import Picture
 from wm_nodes.reports.machine import machine_facts
-from wm_nodes.reports.stages import console
+from wm_nodes.reports.stages import console, say_files
 from wm_nodes.reports.summary import as_first_made, write_summary
 from wm_nodes.training.metrics import FILE_NAME, read_metrics
 from wm_nodes.training.weights import load_weights_file
@@ -103,7 +103,7 @@ def conclude(
     console.print(scores_table(summary), f"reward hacking: {hacking_text(summary)}", sep="\n", highlight=False)
     for alarm in summary.hacked or ():
         console.print(f"[bold yellow]reward hacking[/] after {alarm['step']} buffers: {alarm['text']}", highlight=False)
-    console.print(f"report   {report}\nsummary  {path}\nbag      {summary.bag}", highlight=False)
+    say_files(report, path, summary.bag)
 
 
 def known_scores(before: Mapping[str, Sequence[float]], after: Mapping[str, Sequence[float]]) -> list[str]:

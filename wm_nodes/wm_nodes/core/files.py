@@ -4,6 +4,7 @@ import hashlib
 import os
 import threading
 from pathlib import Path
+from typing import TextIO
 
 
 def write_atomic(path: Path, data: bytes, *, flush: bool = True) -> None:
@@ -42,6 +43,16 @@ def text_lines(data: bytes) -> list[str]:
     """
     *lines, last = data.decode("utf-8-sig").split("\n")
     return [*lines, last] if last else lines
+
+
+def open_to_append(path: Path) -> TextIO:
+    """Open a file of lines to write more of them; one that was cut, as by a full disk, is ended first, as the next line
+    would be lost with it. Raises OSError."""
+    with open(path, "ab+") as file:
+        if file.tell():
+            file.seek(-1, os.SEEK_END)
+            file.write(b"" if file.read(1) == b"\n" else b"\n")
+    return open(path, "a", encoding="utf-8")
 
 
 def file_sha256(path: Path) -> str:

@@ -86,6 +86,7 @@ def _make(scenario: str, given: Mapping[str, str], *, compare: bool) -> tuple[Gr
     config, options, record = take_up(run_dir, starter, kept, settings, compare=compare)
     of_start = {name: value for name, value in given.items() if name in OF_ONE_START}
     values = parse_arguments(scenario, {**options, **of_start, "run_dir": str(run_dir)})
+    _check_used(given, values)
     _check_judge(scenario, values, config, settings)
     values = _resolve(scenario, values, config)
     graph = build_graph(scenario, values)
@@ -123,12 +124,19 @@ def _settings(scenario: str, given: Mapping[str, str]) -> dict[str, Any]:
     if scenario_of(scenario).loop == VIDEO and (reward := given.get("reward")):
         if reward != AGENT:
             raise GraphError(f"reward {reward!r} is of policies; for the video model give agent or nothing")
-        settings |= reward_overrides(reward)
+        settings = reward_overrides(reward) | settings  # a weight of one that is given by name wins
     return settings
 
 
 def _reward(scenario: str, options: Mapping[str, str]) -> str | None:
     return AGENT if scenario == "judge_clips" else options.get("reward")
+
+
+def _check_used(given: Mapping[str, str], values: Mapping[str, str]) -> None:
+    """Raise GraphError for an argument that another one would have to be given with."""
+    for name, other, value in (("video_model_dir", "backend", "video_model"), ("view_port", "view", PAGE)):
+        if given.get(name, "0") not in ("", "0") and values.get(other, value) != value:
+            raise GraphError(f"{name} would change nothing without {other}:={value}")
 
 
 def _check_judge(

@@ -45,8 +45,8 @@ class Bag:
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
         recover = "run `wm recover-bag {}` and read the bag that it writes"
-        partial = self.path.with_name(self.path.name + PARTIAL_SUFFIX)
         if not self.path.exists():
+            partial = self.path.with_name(self.path.name + PARTIAL_SUFFIX)
             if partial.exists():
                 raise BagError(f"bag {self.path} was never completed (recorder killed?); {recover.format(partial)}")
             raise BagError(f"no bag at {self.path}; give the folder that holds {METADATA}")

@@ -47,7 +47,7 @@ def recover(path: Path, *, output: Path | None = None) -> RecoverReport:
 
     Args:
         path: the `.partial` folder, a bag folder with damaged files, or one .mcap or .db3 file.
-        output: the new bag; by default the final name the recorder would have used, else `<name>_recovered`.
+        output: the new bag; by default `<name>_recovered` beside it, where <name> is without `.partial`.
 
     Raises:
         BagError: nothing to read at `path`, no complete message in it, or `output` exists.
@@ -123,6 +123,7 @@ def _copy_topic(recorded: Connection, writer: RawBagWriter, note: Note) -> bool:
 
 
 def _default_output(path: Path) -> Path:
+    path = path.absolute() if path == Path() else path
     if path.name.endswith(PARTIAL_SUFFIX):
         final = path.with_name(path.name.removesuffix(PARTIAL_SUFFIX))
         return final.with_name(f"{final.name}_recovered")

@@ -124,14 +124,14 @@ def _sheet(
 
 
 def _shown_steps(num_frames: int, max_columns: int, wanted: Iterable[int]) -> list[int]:
-    """Evenly spaced steps; a wanted step replaces its nearest inner neighbour."""
+    """Evenly spaced steps; a wanted step replaces the nearest inner one that is not wanted."""
     count = min(num_frames, max_columns)
     steps = [int(step) for step in np.linspace(0, num_frames - 1, count).round()]
-    for step in wanted:
-        if count > 2 and 0 < step < num_frames - 1 and step not in steps:
-            inner = np.asarray(steps[1:-1])
-            steps[1 + int(np.abs(inner - step).argmin())] = step
-    return sorted(set(steps))
+    wanted = {step for step in wanted if 0 < step < num_frames - 1}
+    for step in sorted(wanted - {*steps}):
+        if inner := [other for other in steps[1:-1] if other not in wanted]:
+            steps[steps.index(min(inner, key=lambda other: abs(other - step)))] = step
+    return sorted(steps)
 
 
 def _check(rows: Mapping[str, UInt8Array]) -> None:

@@ -4,6 +4,7 @@ The pages are in templates/, where every value is escaped unless it is Markup.
 """
 
 import base64
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,8 +36,14 @@ class Picture:
     """Of the file."""
 
 
-def write_report(run_dir: Path, summary: Summary, pictures: Sequence[Picture] = (), *, config_text: str = "") -> Path:
-    """Write <run_dir>/report.html and return its path. Raises FileNotFoundError: a picture does not exist."""
+def write_report(
+    run_dir: Path, summary: Summary, pictures: Sequence[Picture] = (), *, config_text: str = "", again: str = ""
+) -> Path:
+    """Write <run_dir>/report.html and return its path. Raises FileNotFoundError: a picture does not exist.
+
+    Args:
+        again: the command that trains from the bag to the same weights; empty: none does.
+    """
     results = (
         (row.label, *(text for c in (row.real, row.imagined)
                       for text in (c.count, c.percent, c.interval.removeprefix("95 %: "))))
@@ -45,7 +52,7 @@ def write_report(run_dir: Path, summary: Summary, pictures: Sequence[Picture] = 
     return write_page(
         "policy.html", run_dir, summary, pictures, config_text,
         title=f"{summary.task}: a policy trained inside a world model", verdict=tables.verdict(summary),
-        results=results, tables=tables, **_acceptance(summary.acceptance),
+        results=results, tables=tables, again=again, **_acceptance(summary.acceptance),
     )
 
 
@@ -58,7 +65,7 @@ def write_page(
     pages = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True
     )
-    pages.filters["base64"] = _base64
+    pages.filters |= {"base64": _base64, "quoted": lambda path: shlex.quote(str(path))}
     page = pages.get_template(template).render(
         run_dir=run_dir, summary=summary, pictures=pictures, config_text=config_text, **values
     )

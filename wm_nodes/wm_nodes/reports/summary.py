@@ -57,7 +57,7 @@ class Summary:
     imagined_after: SuccessRate
     """And after."""
     imagined_steps_per_s: float
-    """Environment steps of the training in the world model, per second of training."""
+    """Environment steps of the training in the world model, per second of training; NaN: not timed."""
     bag: str
     """Path of the recorded training, in the file relative to the run folder."""
     paired: Mapping[str, Any] = field(default_factory=dict)

@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from wm_nodes.core.files import text_lines
+from wm_nodes.core.files import open_to_append, text_lines
 from wm_nodes.core.progress import tqdm
 from wm_nodes.training import checkpoint
 
@@ -142,5 +142,5 @@ class TrainingLoop:
             return
         self.run_dir.mkdir(parents=True, exist_ok=True)
         line = {"iteration": self.iteration, "seconds": round(seconds, 2), **metrics}
-        with open(self.run_dir / f"metrics_{self.name}.jsonl", "a", encoding="utf-8") as file:
+        with open_to_append(self.run_dir / f"metrics_{self.name}.jsonl") as file:
             file.write(json.dumps(line) + "\n")

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wm_nodes.core.files import text_lines, write_atomic
+from wm_nodes.core.files import open_to_append, text_lines, write_atomic
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
@@ -24,7 +24,7 @@ class MetricsWriter:
     def __init__(self, run_dir: Path, *, tensorboard: bool = True) -> None:
         run_dir.mkdir(parents=True, exist_ok=True)
         self._folder = run_dir / "tensorboard" if tensorboard else None
-        self._file = open(run_dir / FILE_NAME, "a", encoding="utf-8")  # noqa: SIM115
+        self._file = open_to_append(run_dir / FILE_NAME)
         self._board: SummaryWriter | None = None
 
     def write(self, section: str, step: int, scalars: Mapping[str, float]) -> None:

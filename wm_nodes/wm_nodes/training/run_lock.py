@@ -146,8 +146,11 @@ def _opened(path: Path) -> Iterator[int]:
     while True:
         try:
             file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        except PermissionError:  # another user's: enough to say who holds it
-            file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        except PermissionError as error:  # another user's: enough to say who holds it
+            try:
+                file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            except FileNotFoundError:
+                raise error from None
         try:
             with suppress(OSError):  # a file system without flock: two at the same moment are not told apart
                 fcntl.flock(file, fcntl.LOCK_EX)

@@ -15,6 +15,7 @@ another path to what a model's folder, a recording or a file held when the run f
 """
 
 import hashlib
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -215,7 +216,8 @@ def _renamed(value: Any, old: str, new: str) -> Any:
         return {name: _renamed(part, old, new) for name, part in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
         return [_renamed(part, old, new) for part in value]
-    return value.replace(old, new) if isinstance(value, str) else value
+    beginning = rf"(?<![^,]){re.escape(old)}"  # of a path, and of each of several with commas between them
+    return re.sub(beginning, lambda _: new, value) if isinstance(value, str) else value
 
 
 def _lies_in(name: str, section: str) -> bool:

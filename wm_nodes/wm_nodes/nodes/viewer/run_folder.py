@@ -50,7 +50,8 @@ class RunFolder:
     """Shows a run folder on a page. path: of the run, or of one of its rounds."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path.parent.parent if path.parent.name == "rounds" else path
+        whole = path.absolute()
+        self.path = whole.parent.parent if whole.parent.name == "rounds" else whole
         self._seen: object = None
 
     @property
