@@ -46,7 +46,8 @@ def run(arguments: argparse.Namespace) -> None:
     version = progress(run_dir)[0] if arguments.version is None else arguments.version
     if version:
         load_weights_file(folder.network, run_dir / VIDEO_FILES.uri(version))
-    recordings = load_clips(recorded_episodes(run_dir, "train"), config.model.stride, config.clip_steps)
+    bags = recorded_episodes(run_dir, "train")
+    recordings = load_clips(bags, config.model.stride, config.clip_steps, config.task)
     said = ""
     with tqdm(total=arguments.episodes, desc="accepted clips", unit="episode") as bar:
 

@@ -152,7 +152,7 @@ def _clips(arguments: argparse.Namespace, run_dir: Path) -> Outcome:
     device = compute_device(config.device)
     folder = load_video_folder(run_dir / "video_model", device)
     bags = recorded_buffers.recorded_episodes(run_dir, "train")
-    contexts = load_clips(bags, config.model.stride, config.clip_steps)
+    contexts = load_clips(bags, config.model.stride, config.clip_steps, config.task)
     source = RecordedContexts(folder, contexts, config, load_probe(shipped_model(config.task), device))
     with _clip_judge(config, run_dir, contexts, clip_fps(bags[0], config.model.stride)) as judge:
         recordings = recorded_buffers.recorded_bags(run_dir)
