@@ -69,6 +69,20 @@ def test_a_clip_equal_to_its_recording_has_full_scores_and_a_shifted_object_lose
         score_clips(moved[:, :2], clips, TruthfulProbe(), 1)  # type: ignore[arg-type]
 
 
+def test_the_goal_above_an_object_is_where_the_clip_shows_it_and_not_where_the_recording_left_it() -> None:
+    """The recorded cube is pushed by 20 cm; in the clip it stays, and the tool gets to 8 cm above its middle."""
+    positions = torch.tensor([10.0, 10, 40, 40, 10, 50, 50]).expand(1, 3, 7).clone()
+    positions[0, 2, 0] = 30
+    clips = replace(recorded(positions), task="reach")
+    made = clips.frames.clone()
+    made[0, 2, 0, :5, 0] = torch.tensor([10, 10, 10, 10, 10])
+    found = score_clips(made, clips, TruthfulProbe(), 1)  # type: ignore[arg-type]
+    assert (float(found["success"]), float(found["outcome"])) == (1.0, 1.0)
+    made[0, 2, 0, 0, 0] = 14  # the cube 4 cm off, of which 2 cm are tolerated
+    off = score_clips(made, clips, TruthfulProbe(), 1)  # type: ignore[arg-type]
+    assert float(off["success"]) == 0.0 and float(off["outcome"]) == pytest.approx(np.exp(-0.02 / 0.05), abs=1e-5)
+
+
 def test_scenery_is_unknown_where_nothing_stands_still_and_is_no_reward_there() -> None:
     """The second of two recordings is of a camera that moves."""
     frames = flat_clips(100, 100)
