@@ -132,6 +132,25 @@ def test_held_out_scores_are_written_every_so_many_buffers_and_the_alarm_with_th
     assert written(read_metrics(tmp_path, "grpo")[0], SCORES) == documented("section `grpo`")
 
 
+def test_an_evaluation_that_the_process_did_not_live_to_see_is_made_up_for(
+    tmp_path: Path, network: VideoNetwork
+) -> None:
+    def killed() -> dict[str, float]:
+        raise KeyboardInterrupt
+
+    run = VideoRun(network, config(every=2), tmp_path, heldout=killed)
+    with pytest.raises(KeyboardInterrupt):
+        train(run, [1, 2])
+    run.close()
+    wanted, resumed = weights(network), tiny_network(seed=4)
+    heldout = Falling(resumed)
+    run = VideoRun(resumed, config(every=2), tmp_path, heldout=heldout)
+    train(run, [3, 4])
+    run.close()
+    assert [line["step"] for line in read_metrics(tmp_path, "heldout")] == [2, 4]
+    assert all(torch.equal(value, wanted[name]) for name, value in heldout.seen[0].items())
+
+
 def test_raw_rewards_and_the_noise_are_in_the_log(tmp_path: Path, network: VideoNetwork) -> None:
     run = VideoRun(network, config(every=0), tmp_path)
     buffer = toy_buffer(network, ROLLOUT)
