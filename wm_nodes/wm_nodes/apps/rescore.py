@@ -159,6 +159,8 @@ def _clips(arguments: argparse.Namespace, run_dir: Path) -> Outcome:
         clips = chain.from_iterable(recorded_buffers.read_clips(recording, pictures=True) for recording in recordings)
         shown = tqdm(clips, desc="rescoring", unit="buffer")
         rows = [recorded_buffers.rescore(recorded, source, judge) for recorded in shown]
+    if not rows:
+        raise ValueError(f"{run_dir} holds no scored clips: it was stopped before its first score; go on with it")
     equal = all(not row.different for row in rows)
     words = "every score is the recorded one, bit for bit" if equal else "scores differ from the bag's"
     if not all(row.same_reward for row in rows):
