@@ -1,5 +1,6 @@
 """Clips, scores, settings and folder of the video model."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,7 +24,7 @@ from wm_nodes.video_model.conditions import hashed_words
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
 from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, mix_rewards, score_clips, score_pictures
 from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
-from wm_nodes.world_model.positions import position_names
+from wm_nodes.world_model.positions import position_names, probe_targets
 from wm_nodes.world_model.tokenizer import NUM_POSITIONS
 
 
@@ -66,6 +67,20 @@ def test_a_clip_equal_to_its_recording_has_full_scores_and_a_shifted_object_lose
     assert float(off["tracking"]) == pytest.approx((np.exp(-1) + 1) / 2, abs=1e-5)
     with pytest.raises(ValueError, match="their recordings"):
         score_clips(moved[:, :2], clips, TruthfulProbe(), 1)  # type: ignore[arg-type]
+
+
+def test_the_goal_above_an_object_is_where_the_clip_shows_it_and_not_where_the_recording_left_it() -> None:
+    """The recorded cube is pushed by 20 cm; in the clip it stays, and the tool gets to 8 cm above its middle."""
+    positions = torch.tensor([10.0, 10, 40, 40, 10, 50, 50]).expand(1, 3, 7).clone()
+    positions[0, 2, 0] = 30
+    clips = replace(recorded(positions), task="reach")
+    made = clips.frames.clone()
+    made[0, 2, 0, :5, 0] = torch.tensor([10, 10, 10, 10, 10])
+    found = score_clips(made, clips, TruthfulProbe(), 1)  # type: ignore[arg-type]
+    assert (float(found["success"]), float(found["outcome"])) == (1.0, 1.0)
+    made[0, 2, 0, 0, 0] = 14  # the cube 4 cm off, of which 2 cm are tolerated
+    off = score_clips(made, clips, TruthfulProbe(), 1)  # type: ignore[arg-type]
+    assert float(off["success"]) == 0.0 and float(off["outcome"]) == pytest.approx(np.exp(-0.02 / 0.05), abs=1e-5)
 
 
 def test_scenery_is_unknown_where_nothing_stands_still_and_is_no_reward_there() -> None:
@@ -180,6 +195,31 @@ def test_episodes_of_unequal_length_are_refused_or_cut_and_no_clip_shows_a_frame
         np.testing.assert_array_equal(clips.frames[row], episode.images[:5:2])
         np.testing.assert_array_equal(clips.actions[row].flatten(), episode.actions[:4].flatten())
         np.testing.assert_array_equal(clips.ground_truth[row], episode.ground_truth[:5:2])
+
+
+def test_episodes_that_were_recorded_for_another_task_of_the_scene_are_paid_and_told_as_the_one_that_is_asked_for(
+    tmp_path: Path,
+) -> None:
+    """Those of `reach` are recorded for push_cube: the cube is in the goal, and the tool beside it."""
+    truth = np.zeros((5, len(GROUND_TRUTH_NAMES)), np.float32)
+    truth[:, GROUND_TRUTH_NAMES.index("tool_x")] = 0.5
+    bag = written(tmp_path, 4, ground_truth=truth)
+    pushed, reached = (load_clips([bag], 2, 0, task) for task in ("", "reach"))
+    assert (pushed.task, pushed.instructions) == ("push_cube", ("push the cube to the goal",))
+    assert (reached.task, reached.instructions) == ("reach", ("move the gripper above the blue cube",))
+    pictures, done = flat_clips(0), list[float]()
+    for clips in (pushed, reached):
+        shown = replace(clips, frames=pictures)
+        probe: Any = SimpleNamespace(read=lambda images, shown=shown: probe_targets(
+            shown.ground_truth[:, 1:], shown.task
+        ))
+        done.append(float(score_clips(pictures, shown, probe, 1)["success"]))
+    assert done == [1.0, 0.0]
+    with pytest.raises(ValueError, match="recorded for the task push_cube, whose scene does not show pull_cube"):
+        load_clips([bag], 2, 0, "pull_cube")
+    mixed = written(tmp_path / "mixed", 4, 4, task="reach")
+    with pytest.raises(ValueError, match="episodes of push_cube, reach are no clips of one task"):
+        load_clips([mixed], 2)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

@@ -92,7 +92,8 @@ def test_the_shipped_video_model_serves_the_recommended_settings_and_no_others()
     assert shipped is not None and isinstance(shipped.codec, TokenizerCodec)
     assert shipped.manifest["heldout"]["tool_cm"] < 0.2 * shipped.manifest["heldout"]["copy_tool_cm"]
     assert shipped_video_model(load_video_config("recommended", {"model.width": 64})) is None
-    assert shipped_video_model(load_video_config("recommended", {"task": "pull_cube"})) is None
+    for other in ("pull_cube", "reach"):
+        assert shipped_video_model(load_video_config("recommended", {"task": other})) is None
 
 
 @pytest.mark.parametrize("size", [(64, 128), (96, 192), (128, 256)])

@@ -203,3 +203,11 @@ def test_each_clip_of_a_rollout_is_scored_by_itself() -> None:
     assert [found[f"psnr_db_{clip}"] for clip in (1, 3, 4)] == pytest.approx([80.0] * 3)
     assert found["psnr_db_2"] == pytest.approx(-10 * np.log10((50 / 255) ** 2 / 2), abs=1e-3)
     assert {f"{name}_{clip}" for name in ("tool_cm", "object_cm", "psnr_db") for clip in (1, 2, 3, 4)} == found.keys()
+
+
+def test_of_a_model_that_is_given_no_frame_the_first_one_is_scored_too() -> None:
+    clips, folder = recorded(), replace(make_folder(given=0), clip={"stride": 1, "num_conditioning": 0})
+    frames = clips.frames.clone()
+    frames[:, 0] += 50
+    found = horizon_scores(frames, clips, PositionProbe(8, 12), folder)
+    assert float(found["psnr_db_1"].mean()) == pytest.approx(-10 * np.log10((50 / 255) ** 2 / FRAMES), abs=1e-3)

@@ -3,6 +3,7 @@ it; on real recordings, with the shipped models."""
 
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -129,6 +130,13 @@ def test_the_verb_writes_a_bag_that_says_it_is_imagined_and_a_policy_learns_from
     errors = [np.abs(one.act(images, states).actions - actions).mean() for one in (policy, fresh)]
     assert errors[0] < 0.5 * errors[1], "the policy has not learned the bag's actions"
     load_weights_file(fresh, tmp_path / "weak.safetensors")
+
+
+def test_clips_that_are_made_of_the_recorded_actions_are_not_followed(tmp_path: Path) -> None:
+    given, nothing_is_read = CONFIG.with_values(groups=CONFIG.groups.with_values(hide_actions=False)), cast(Clips, None)
+    with pytest.raises(ValueError, match=r"repeat the recorded actions.*--preset outcome \(groups\.hide_actions\)"):
+        write_followed_episodes(tmp_path / "bag", FOLDER, nothing_is_read, given, PROBE, 1)
+    assert not (tmp_path / "bag").exists()
 
 
 def test_a_bag_that_is_there_is_kept_and_a_model_none_of_whose_clips_is_accepted_leaves_none(

@@ -302,6 +302,13 @@ def test_a_model_that_does_not_say_which_weights_are_its_condition_is_refused_an
     assert model.offset.requires_grad
 
 
+def test_weights_whose_number_format_swallows_the_steps_are_refused() -> None:
+    """Of bfloat16 weights of 0.02 few moved in 200 steps of 2e-6; an update that moves nothing is the check's."""
+    with pytest.raises(ValueError, match=r"weights of bfloat16 round steps of learning_rate 2e-06 to nothing; load"):
+        make(network=tiny_network().bfloat16(), learning_rate=2e-6)
+    make(network=tiny_network().bfloat16(), learning_rate=0.0)
+
+
 def test_a_log_space_kl_measures_against_its_own_anchor() -> None:
     """From DD-12: log r of the weights now to those of the anchor, at the stored x_s; not to those that sampled."""
     learner = make(kl=kl_config("logk2", 0.5, "frozen"))

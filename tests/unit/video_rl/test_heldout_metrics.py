@@ -101,6 +101,7 @@ def test_a_model_of_another_codec_has_no_reader_but_its_own(tmp_path: Path) -> N
     network = VideoNetwork(NetworkSettings(6, 3, 4, 16, 2))
     save_video_folder(tmp_path, small_codec(), network, {"stride": 2, "num_conditioning": 1}, {})
     assert reader_of(tmp_path, "push_cube", world) is None
+    assert reader_of(world / "video_model", "reach", world) is None, "those that are shipped are of push_cube"
     save_success_reader(tmp_path, SuccessReader(64, 128, 0.25), "push_cube", {})
     own, shared = (reader_of(folder, "push_cube", world) for folder in (tmp_path, world / "video_model"))
     same_stride = load_success_reader(world / "video_model_outcome", "push_cube")

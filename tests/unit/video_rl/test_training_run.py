@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from metric_docs import documented, written
@@ -12,9 +13,14 @@ from video_toys import tiny_network, toy_buffer, toy_rollout_settings, weights
 
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.recording import BagError
+from wm_nodes.recording.messages import header, message_type, serialize
+from wm_nodes.recording.raw import RawBagWriter
+from wm_nodes.recording.topics import CLIP_SCORES, CLIPS, DEFAULT_NAMESPACE, RUN_STATE, RecordedTopic, absolute
 from wm_nodes.training.metrics import read_metrics
 from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model import VideoNetwork
+from wm_nodes.video_rl.recorded_buffers import read_clips, trained_clips
 from wm_nodes.video_rl.reward_hacking import WATCHED, alarm_text, hacked_slopes, hacking_alarms, watched_scores
 from wm_nodes.video_rl.training_run import VIDEO_FILES, VideoRun, progress
 
@@ -130,6 +136,60 @@ def test_held_out_scores_are_written_every_so_many_buffers_and_the_alarm_with_th
     assert last["hacked_tracking"] == pytest.approx(-0.1) and "hacked_psnr_db" not in last
     assert written(last, SCORES) | SCORES <= documented("section `heldout`")
     assert written(read_metrics(tmp_path, "grpo")[0], SCORES) == documented("section `grpo`")
+
+
+def test_an_evaluation_that_the_process_did_not_live_to_see_is_made_up_for(
+    tmp_path: Path, network: VideoNetwork
+) -> None:
+    def killed() -> dict[str, float]:
+        raise KeyboardInterrupt
+
+    run = VideoRun(network, config(every=2), tmp_path, heldout=killed)
+    with pytest.raises(KeyboardInterrupt):
+        train(run, [1, 2])
+    run.close()
+    wanted, resumed = weights(network), tiny_network(seed=4)
+    heldout = Falling(resumed)
+    run = VideoRun(resumed, config(every=2), tmp_path, heldout=heldout)
+    train(run, [3, 4])
+    run.close()
+    assert [line["step"] for line in read_metrics(tmp_path, "heldout")] == [2, 4]
+    assert all(torch.equal(value, wanted[name]) for name, value in heldout.seen[0].items())
+
+
+def write_clips(path: Path, iterations: list[int], *others: RecordedTopic) -> Path:
+    """The recording of one start of a run: signs of life, and a clip with its score for each iteration."""
+    names = {topic: absolute(DEFAULT_NAMESPACE, topic) for topic in (RUN_STATE, *others)}
+    with RawBagWriter(path) as bag:
+        for topic, name in names.items():
+            bag.add_topic(name, topic.msgtype)
+        alive = message_type(RUN_STATE.msgtype)
+        bag.write(names[RUN_STATE], serialize(alive(header(1, ""), "run", "/wm/learner", 1, "")), 1)
+        for iteration in iterations:
+            contexts, one = np.array([4], np.uint32), np.array([0.5])
+            clips = message_type(CLIPS.msgtype)(
+                header(iteration, ""), 0, 0, iteration, 0, contexts, 1, 3, "buffer", f"{iteration}", 0.1, 0.1
+            )
+            scores = message_type(CLIP_SCORES.msgtype)(
+                header(iteration, ""), 0, 0, iteration, f"{iteration}", 1, one, ["psnr_db"], one, one,
+                np.array([1], np.uint8), "", "", "reference", 0.1,
+            )
+            for topic, message in ((CLIPS, clips), (CLIP_SCORES, scores)):
+                bag.write(names[topic], serialize(message), 2 + iteration)
+    return path
+
+
+def test_a_start_that_was_stopped_before_its_first_score_does_not_hide_the_clips_of_the_others(tmp_path: Path) -> None:
+    stopped, sampled = write_clips(tmp_path / "a", []), write_clips(tmp_path / "b", [], CLIPS, CLIP_SCORES)
+    trained = write_clips(tmp_path / "c", [0, 1], CLIPS, CLIP_SCORES)
+    clips = trained_clips([stopped, sampled, trained], 2)
+    assert [(one.iteration, one.contexts.tolist(), one.total.tolist()) for one in clips] == [
+        (0, [4], [0.5]), (1, [4], [0.5])
+    ]
+    with pytest.raises(BagError, match="2 of 2 iterations, from 0 on, have no scored clips"):
+        trained_clips([stopped, sampled], 2)
+    with pytest.raises(BagError, match="c has no message on /wm/clips/image"):
+        list(read_clips(trained, pictures=True))
 
 
 def test_raw_rewards_and_the_noise_are_in_the_log(tmp_path: Path, network: VideoNetwork) -> None:

@@ -98,7 +98,7 @@ def _recorded(arguments: argparse.Namespace, config: VideoRlConfig) -> tuple[Vid
     if not arguments.context_bags:
         raise ValueError("--video-model needs --context-bags: recorded episodes to take first frames and actions from")
     folder = load_video_folder(arguments.video_model, compute_device(config.device))
-    return folder, load_clips(arguments.context_bags, folder.clip["stride"], config.clip_steps)
+    return folder, load_clips(arguments.context_bags, folder.clip["stride"], config.clip_steps, config.task)
 
 
 def _model_to_check(

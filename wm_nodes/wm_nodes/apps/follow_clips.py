@@ -3,7 +3,7 @@
     wm follow-clips runs/RUN --out BAG [--episodes 200]
     wm train-policy --task TASK --demos BAG --sft.num_demonstrations 200
 
-RUN is one of train-video-model, best with --preset outcome --reward execution. Its video model makes a clip from the
+RUN is one of train-video-model --preset outcome, best with --reward execution. Its video model makes a clip from the
 first frame of each of the run's training recordings, and another of each while episodes are missing. The action world
 model follows each clip's motion (as the reward execution does). What it imagines on the way, pictures, states and
 actions at control rate, is an episode where its done signal says that the task got done. Nothing else of a recording
@@ -46,7 +46,8 @@ def run(arguments: argparse.Namespace) -> None:
     version = progress(run_dir)[0] if arguments.version is None else arguments.version
     if version:
         load_weights_file(folder.network, run_dir / VIDEO_FILES.uri(version))
-    recordings = load_clips(recorded_episodes(run_dir, "train"), config.model.stride, config.clip_steps)
+    bags = recorded_episodes(run_dir, "train")
+    recordings = load_clips(bags, config.model.stride, config.clip_steps, config.task)
     said = ""
     with tqdm(total=arguments.episodes, desc="accepted clips", unit="episode") as bar:
 

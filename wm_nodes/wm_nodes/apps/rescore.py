@@ -152,13 +152,15 @@ def _clips(arguments: argparse.Namespace, run_dir: Path) -> Outcome:
     device = compute_device(config.device)
     folder = load_video_folder(run_dir / "video_model", device)
     bags = recorded_buffers.recorded_episodes(run_dir, "train")
-    contexts = load_clips(bags, config.model.stride, config.clip_steps)
+    contexts = load_clips(bags, config.model.stride, config.clip_steps, config.task)
     source = RecordedContexts(folder, contexts, config, load_probe(shipped_model(config.task), device))
     with _clip_judge(config, run_dir, contexts, clip_fps(bags[0], config.model.stride)) as judge:
         recordings = recorded_buffers.recorded_bags(run_dir)
         clips = chain.from_iterable(recorded_buffers.read_clips(recording, pictures=True) for recording in recordings)
         shown = tqdm(clips, desc="rescoring", unit="buffer")
         rows = [recorded_buffers.rescore(recorded, source, judge) for recorded in shown]
+    if not rows:
+        raise ValueError(f"{run_dir} holds no scored clips: it was stopped before its first score; go on with it")
     equal = all(not row.different for row in rows)
     words = "every score is the recorded one, bit for bit" if equal else "scores differ from the bag's"
     if not all(row.same_reward for row in rows):

@@ -98,6 +98,7 @@ def _run(
         training.close()
     conclude(
         config, run_dir, base=base, iterations=training.iterations, version=training.version,
-        heldout=load_clips(heldout, folder.clip["stride"], config.clip_steps), probe=load_probe(judge, device),
-        preset=f"as in {source.name}", bag="", command=arguments.command, minutes=stage.minutes,
+        heldout=load_clips(heldout, folder.clip["stride"], config.clip_steps, config.task),
+        probe=load_probe(judge, device), preset=f"as in {source.name}", bag="", command=arguments.command,
+        minutes=stage.minutes,
     )

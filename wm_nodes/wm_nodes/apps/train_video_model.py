@@ -113,9 +113,9 @@ def _run(arguments: argparse.Namespace, config: VideoRlConfig, run_dir: Path) ->
         heldout_bags = linked([*map(Path, arguments.heldout_bags)], run_dir / "data" / "heldout")
     else:
         bags, heldout_bags = _data(scene, config.context_episodes if shipped else config.data_episodes, run_dir, stage)
-    heldout = load_clips(heldout_bags, config.model.stride, config.clip_steps)
+    heldout = load_clips(heldout_bags, config.model.stride, config.clip_steps, config.task)
     stage("video model: " + ("the shipped one" if shipped else "flow matching"))
-    clips = load_clips(bags, config.model.stride, config.clip_steps)
+    clips = load_clips(bags, config.model.stride, config.clip_steps, config.task)
     if config.rewards.get(EXECUTION):
         check_execution(config, clips)
     if config.rewards.get("scenery") and not config.groups.history:

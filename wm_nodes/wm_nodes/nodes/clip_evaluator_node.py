@@ -59,7 +59,7 @@ class ClipEvaluatorNode(ManagedNode):
         device = compute_device(self._config.device)
         folder = load_video_folder(Path(str(self.param("video_model_dir"))), device)
         bags = [Path(text) for text in self.param("context_bags") if text]
-        contexts = load_clips(bags, folder.clip["stride"], self._config.clip_steps)
+        contexts = load_clips(bags, folder.clip["stride"], self._config.clip_steps, self._config.task)
         probe = load_probe(Path(str(self.param("model_dir"))), device)
         self._source = RecordedContexts(folder, contexts, self._config, probe)
         self._fps = clip_fps(bags[0], folder.clip["stride"])

@@ -52,7 +52,7 @@ class VideoModelNode(ManagedNode):
         config = load_video_config(str(self.param("config_file")))
         folder = load_video_folder(Path(str(self.param("video_model_dir"))), compute_device(config.device))
         bags = [Path(text) for text in self.param("context_bags") if text]
-        contexts = load_clips(bags, folder.clip["stride"], config.clip_steps)
+        contexts = load_clips(bags, folder.clip["stride"], config.clip_steps, config.task)
         self._generator = RecordedContexts(folder, contexts, config)
         self._files = named_files(self)
         self._loaded = (0, "")  # version and, unless it is the folder's own, sha256

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wm_nodes.config.tasks import get_task
+from wm_nodes.config.tasks import get_task, same_scene
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Episode, FloatArray, UInt8Array
 from wm_nodes.recording import read_episodes, read_spec
@@ -80,14 +80,17 @@ class Clips:
         return Condition(first, self.actions, hashed_words(self.instructions, text_dim)).to(first.device)
 
 
-def load_clips(bags: Sequence[Path], stride: int, steps: int = 0) -> Clips:
+def load_clips(bags: Sequence[Path], stride: int, steps: int = 0, task: str = "") -> Clips:
     """Load the episodes of the bags, in order, as clips of one length: no frame is made up.
 
-    steps: of each clip; longer episodes are cut there, shorter ones left out. 0: all episodes have one length.
+    Args:
+        steps: of each clip; longer episodes are cut there, shorter ones left out. 0: all episodes have one length.
+        task: of the clips. Episodes that were recorded for another one in its scene show it too; their clips have its
+            instruction. Empty: the one that they were recorded for.
 
     Raises:
-        BagError: a bag is missing, damaged, or of another version. ValueError: no episodes, of different sizes or
-            lengths, or with an action or simulator state that is no number.
+        BagError: a bag is missing, damaged, or of another version. ValueError: no episodes, of different sizes, lengths
+            or tasks, of a task in another scene, or with an action or simulator state that is no number.
     """
     frames, rest = list[UInt8Array](), list[Episode]()
     for episode in (checked(episode, bag) for bag in bags for episode in read_episodes(bag)):
@@ -105,7 +108,17 @@ def load_clips(bags: Sequence[Path], stride: int, steps: int = 0) -> Clips:
         raise ValueError(f"no episode has {steps} steps, the longest {max(lengths)}; lower clip_steps")
     if len(sizes := {some.shape[1:] for some in frames}) > 1:
         raise ValueError(f"episodes of different picture sizes cannot be mixed: {sorted(sizes)}")
-    stacked = stack_episodes(kept, [episode.task for episode in kept[:1]], num_steps=steps or None)
+    recorded = sorted({episode.task for episode in kept})
+    if len(recorded) > 1:
+        raise ValueError(f"episodes of {', '.join(recorded)} are no clips of one task; name recordings of one of them")
+    task = task or "".join(recorded)
+    stacked = stack_episodes(kept, [task], num_steps=steps or None)
+    instructions = stacked.instructions
+    if [task] != recorded:
+        if not same_scene(task, recorded[0]):
+            raise ValueError(f"{bags[0]} was recorded for the task {recorded[0]}, whose scene does not show {task}; "
+                             f"set task {recorded[0]}, or name other recordings")
+        instructions = (get_task(task).instruction,) * len(stacked)
     if stacked.num_steps % stride:
         raise ValueError(
             f"episodes of {stacked.num_steps} steps cannot be cut at every {stride}th frame; choose a divisor"
@@ -113,7 +126,7 @@ def load_clips(bags: Sequence[Path], stride: int, steps: int = 0) -> Clips:
     actions = stacked.actions.reshape(len(stacked), stacked.num_steps // stride, -1)
     return Clips(
         frames=torch.from_numpy(np.stack(frames)), actions=torch.from_numpy(np.ascontiguousarray(actions)),
-        ground_truth=stacked.ground_truth[:, ::stride], instructions=stacked.instructions, task=stacked.tasks[0],
+        ground_truth=stacked.ground_truth[:, ::stride], instructions=instructions, task=task,
         seeds=stacked.seeds, states=stacked.states[:, ::stride], spec=read_spec(bags[0]),
     )
 

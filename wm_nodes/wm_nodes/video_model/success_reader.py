@@ -129,14 +129,19 @@ def load_success_reader(folder: Path, task: str, device: torch.device | str = "c
 
 
 def reader_of(folder: Path, task: str, shipped: Path, device: torch.device | str = "cpu") -> SuccessReader | None:
-    """The reader in a video model's folder, else one in the folder `shipped` of a world model that was trained on what
-    the same codec makes, of clips with the same stride where there is one; None without any."""
+    """The reader in a video model's folder, else one of the task in the folder `shipped` of a world model that was
+    trained on what the same codec makes, of clips with the same stride where there is one; None without any."""
     codec, clip = _seen_through(folder)
     places = [place.parent for place in shipped.glob(f"video_model*/{SUCCESS_MANIFEST}")]
-    places = sorted((place for place in places if _seen_through(place)[0] == codec),
+    places = sorted((place for place in places if _seen_through(place)[0] == codec and _reads(place) == task),
                     key=lambda place: (_seen_through(place)[1] != clip, place))
     found = [place for place in (folder, *places) if (place / SUCCESS_MANIFEST).is_file()]
     return load_success_reader(found[0], task, device) if found else None
+
+
+def _reads(folder: Path) -> str:
+    """The task of the success reader in a folder."""
+    return str(read_manifest(folder, "success reader", FORMAT, SUCCESS_MANIFEST)["task"])
 
 
 def _seen_through(folder: Path) -> tuple[str, int]:

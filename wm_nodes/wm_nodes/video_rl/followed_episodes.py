@@ -45,10 +45,14 @@ def write_followed_episodes(
         on_progress: called with how many clips were accepted and followed.
 
     Raises:
-        BagError: the path exists. ValueError: as make_execution_reward; no clip of any recording is accepted.
+        BagError: the path exists. ValueError: clips of given actions; as make_execution_reward; no clip of any
+            recording is accepted.
     """
     if path.exists():
         raise BagError(f"{path} exists already; choose another name or remove it")
+    if not config.groups.hide_actions:
+        raise ValueError("the clips of this run repeat the recorded actions, and following them gives the recordings "
+                         "again; name a run of train-video-model --preset outcome (groups.hide_actions)")
     reward = make_execution_reward(config, folder, recordings, probe)
     custom = {"wm.video_model_sha256": pack_weights(folder.network).sha256, "wm.video_model_version": str(version)}
     spec = reward.spec(recordings.frames.shape[1])

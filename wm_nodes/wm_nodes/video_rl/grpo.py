@@ -115,6 +115,12 @@ class GrpoLearner:
         self.skipped = 0
         """Buffers in a row, up to now, that no optimizer step was made on."""
         self.parameters = [p for p in model.parameters() if p.requires_grad]
+        narrow = {str(p.dtype).removeprefix("torch.") for p in self.parameters if p.dtype.itemsize < 4}
+        if narrow and settings.learning_rate:
+            raise ValueError(
+                f"weights of {min(narrow)} round steps of learning_rate {settings.learning_rate:g} to nothing; load "
+                "them as float32, or add a LoRA adapter (video_model.adapters.add_lora), which is float32"
+            )
         self._optimizer = torch.optim.AdamW(
             self.parameters, lr=settings.learning_rate, weight_decay=settings.weight_decay
         )

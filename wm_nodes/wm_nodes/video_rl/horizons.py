@@ -72,9 +72,9 @@ def horizon_scores(frames: Tensor, recorded: Clips, probe: PositionProbe, folder
     lengths, first, found, clip = folder.lengths, folder.clip["num_conditioning"], dict[str, Tensor](), 1
     new = lengths.new if lengths else frames.shape[1] - first
     while first < frames.shape[1]:
-        count = min(new, frames.shape[1] - first)
-        part = recorded.window(first - 1, count + 1)
-        scores = score_clips(frames[:, first - 1 : first + count], part, probe, 1)
+        count, given = min(new, frames.shape[1] - first), min(1, first)
+        part = recorded.window(first - given, given + count)
+        scores = score_clips(frames[:, first - given : first + count], part, probe, given)
         found |= {f"{name}_{clip}": scores[name] for name in DRIFT}
         first, clip = first + count, clip + 1
     return found

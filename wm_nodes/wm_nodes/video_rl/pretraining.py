@@ -69,15 +69,16 @@ def make_video_model(
 
 
 def shipped_video_model(config: VideoRlConfig) -> VideoFolder | None:
-    """The video model of these settings that is shipped with the task's world model, on config.device; None where there
-    is none."""
+    """The video model of these settings and task that is shipped with the task's world model, on config.device; None
+    where there is none."""
     try:
         folders = sorted(shipped_model(config.task).glob(f"video_model*/{MANIFEST}"))
     except FileNotFoundError:
         return None
-    for manifest in folders:
-        if read_video_manifest(manifest.parent)["model"] == config.model.model_dump():
-            return load_video_folder(manifest.parent, compute_device(config.device))
+    for path in folders:
+        manifest = read_video_manifest(path.parent)
+        if (manifest["task"], manifest["model"]) == (config.task, config.model.model_dump()):
+            return load_video_folder(path.parent, compute_device(config.device))
     return None
 
 

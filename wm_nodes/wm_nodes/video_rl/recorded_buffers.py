@@ -135,17 +135,19 @@ def recorded_episodes(run_dir: Path, part: Literal["train", "heldout"]) -> list[
 
 
 def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
-    """Yield the scored clips of a live recording, in the order of their scores; unscored ones are left out.
+    """Yield the scored clips of a live recording, in the order of their scores; unscored ones are left out. There is
+    none where a run was stopped before its first score.
 
     Raises:
-        BagError: an unusable bag, or one without clips and scores.
+        BagError: an unusable bag, or scores without clips or pictures.
     """
     wanted = (topics.CLIPS, topics.CLIP_SCORES, *((topics.CLIP_IMAGES,) if pictures else ()))
     rows = {topics.absolute(topics.DEFAULT_NAMESPACE, topic): topic for topic in wanted}
     with Bag(bag) as opened:
         opened.check_types(list(rows))
+        scored = opened.count(topics.absolute(topics.DEFAULT_NAMESPACE, topics.CLIP_SCORES))
         for name in rows:
-            if not opened.count(name):
+            if scored and not opened.count(name):
                 raise BagError(f"bag {bag} has no message on {name}; name a recorded run of train-video-model")
         clips, shown = dict[str, Any](), dict[int, UInt8Array]()
         for name, _, data in opened.messages(list(rows)):

@@ -117,7 +117,8 @@ def distance_left(positions: FloatArray, truth: FloatArray, task: str) -> FloatA
     without a goal.
 
     Args:
-        positions: read off a frame, (N, P). truth: of the scene that the goal is in, the same.
+        positions: read off a frame, (N, P), of what moves and of a thing that the goal is above. truth: of the scene
+            that the goal is in, the same.
     """
     part, (thing, tool, goal) = get_task(task).judge, (columns_of(task, name) for name in ("object", "tool", "goal"))
     rule = part.goal
@@ -127,8 +128,8 @@ def distance_left(positions: FloatArray, truth: FloatArray, task: str) -> FloatA
         place, target = positions[:, thing if rule.mover == "object" else tool[:2]], truth[:, goal]
     else:
         # the probe does not read how high the thing lies
-        height = np.full((len(truth), 1), part.object_height_m + rule.above_thing_m, np.float32)
-        place, target = positions[:, tool], np.concatenate([truth[:, thing], height], 1)
+        height = np.full((len(positions), 1), part.object_height_m + rule.above_thing_m, np.float32)
+        place, target = positions[:, tool], np.concatenate([positions[:, thing], height], 1)
     left: FloatArray = np.linalg.norm(place - target, axis=-1) - rule.radius_m
     return left
 

@@ -85,6 +85,7 @@ class VideoRun(TrainingRun):
             As GrpoLearner.train; or OSError where saving fails: the training was then made; ensure_saved() tries again.
         """
         with self._training:
+            self._watch()  # where the process ended while it looked
             stops = self.network.register_forward_pre_hook(lambda *_: self.check())
             device, micro_batch = device_of(self.network), self.config.grpo.micro_batch
             with stops, explain_memory(device, grpo__micro_batch=micro_batch):
@@ -107,14 +108,18 @@ class VideoRun(TrainingRun):
             self._metrics.close()
 
     def _watch(self) -> None:
-        every = self.config.evaluation.every
-        if self._heldout is None or not every or self.iterations % every:
+        """Evaluate the weights of now where that is due and not done."""
+        every, step = self.config.evaluation.every, self.iterations
+        if self._heldout is None or not every or not step or step % every:
+            return
+        lines = read_metrics(self.run_dir)
+        if any((line["section"], line["step"]) == (SECTION, step) for line in lines):
             return
         scores = self._heldout()
-        lines = [*read_metrics(self.run_dir), {"section": SECTION, "step": self.iterations, **scores}]
+        lines.append({"section": SECTION, "step": step, **scores})
         watched = watched_scores(self.config.groups.hide_actions)
         self.alarms = hacking_alarms(lines, self.config.evaluation.window, watched)
-        self._metrics.write(SECTION, self.iterations, {**scores, **self.alarms})
+        self._metrics.write(SECTION, step, {**scores, **self.alarms})
 
 
 def flatten_metrics(report: BufferReport) -> dict[str, float]:

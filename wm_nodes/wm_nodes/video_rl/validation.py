@@ -73,7 +73,7 @@ def validation_scores(
     Raises:
         BagError: an unusable bag. ValueError: model_dir has no position probe.
     """
-    clips = load_clips(bags, folder.clip["stride"], config.clip_steps)
+    clips = load_clips(bags, folder.clip["stride"], config.clip_steps, config.task)
     probe = load_probe(model_dir, device_of(folder.network))
 
     def scores() -> dict[str, float]:
