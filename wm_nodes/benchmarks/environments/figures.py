@@ -23,7 +23,6 @@ from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.film_strip import film_strip
 from wm_nodes.world_model.validation.controllability import controllability_metrics
-from wm_nodes.world_model.validation.open_loop import HORIZONS
 
 SCRIPTED = "scripted"
 """The configured behaviours, the control of EXTREME."""
@@ -78,11 +77,12 @@ def measure_extreme(config: RunConfig, model_dir: Path, work: Path) -> Iterator[
 
 def extreme_table(rows: Iterable[dict[str, Any]]) -> Table:
     """Of the rows of measure_extreme, at every horizon that they have."""
+    first, *others = "psnr_shuffled_drop_db_h", "tool_command_cm_h", "tool_shuffled_cm_h"
     lines = [
-        (row["task"], row["domain"], row["actions"], str(horizon),
-         *(shown(row["metrics"].get(f"{name}_h{horizon:02d}")) for name in
-           ("psnr_shuffled_drop_db", "tool_command_cm", "tool_shuffled_cm")))
-        for row in rows for horizon in HORIZONS if f"psnr_shuffled_drop_db_h{horizon:02d}" in row["metrics"]
+        (row["task"], row["domain"], row["actions"], str(int(step)), shown(drop),
+         *(shown(row["metrics"].get(f"{name}{step}")) for name in others))
+        for row in rows for metric, drop in row["metrics"].items() if metric.startswith(first)
+        for step in [metric.removeprefix(first)]
     ]
     return make_table(
         "rollouts of extreme actions",
