@@ -67,7 +67,7 @@ def measure_extreme(config: RunConfig, model_dir: Path, work: Path) -> Iterator[
         )
         folder = work.absolute() / f"{config.task}_{domain}_{name}"
         bags = collect_plan(task_plan(chosen, count, HELDOUT.take(count)), chosen, folder)
-        episodes = [episode for bag in bags for episode in read_episodes(bag)]
+        episodes = [episode for bag in bags for episode in read_episodes(bag)][:count]  # earlier calls may want more
         pair = side_by_side(models, episodes[:1], config)[0]
         film_strip(pair.rows, folder / "film_strip.png", marks=pair.done)
         found = controllability_metrics(models, stack_episodes(episodes, [config.task]), models.spec)
