@@ -109,6 +109,7 @@ def test_trainings_by_another_setup_or_of_another_base_are_refused_and_those_tha
         assert main([*call, *more]) == 2 and path.read_bytes() == held
         return " ".join(capsys.readouterr().err.split())
 
+    assert "by another base (recordings.heldout [" in refused("--heldout-bags", call[call.index("--context-bags") + 1])
     samplers, folder = recorded.clip_learning_samplers(), load_video_folder(shipped_model(TASK) / "video_model")
     quicker = [replace(one, grpo=one.grpo.with_values(learning_rate=1e-3)) for one in samplers]
     with monkeypatch.context() as patch:

@@ -10,15 +10,18 @@ import pytest
 from drawn_pendulum import SETTINGS
 from model_folders import make_model_folder, make_stepped_folder, write_starts
 
-from benchmarks.environments.experiments import is_finished
+from benchmarks.environments import experiments
+from benchmarks.environments.experiments import Ranking, _over_seeds, is_finished
 from benchmarks.environments.policies import (
     SIMULATOR,
     WORLD_MODEL,
     Workplace,
+    known_policy,
     rank_policies,
     spearman,
     train_in,
 )
+from benchmarks.experiment import rounded
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
 from wm_nodes.core.files import file_sha256
@@ -88,7 +91,7 @@ def test_imagined_success_is_measured_in_each_model(work: Workplace, tmp_path: P
 def row_of(work: Workplace, model: str = WORLD_MODEL, **changes: object) -> dict[str, Any]:
     config = load_config("smoke", SMALL | changes)
     other = Workplace(config, work.model_dir, work.folder)
-    return {"real_before": {}, **json.loads(json.dumps(other.identity(model, ["train"])))}
+    return {"real_before": {}, **rounded(other.identity(model, ["train"]))}
 
 
 def test_a_row_is_known_by_every_setting_by_the_models_and_by_the_scenes(work: Workplace, tmp_path: Path) -> None:
@@ -98,10 +101,42 @@ def test_a_row_is_known_by_every_setting_by_the_models_and_by_the_scenes(work: W
     for changes in ({"ppo.learning_rate": 1e-5}, {"evaluation.episodes": 3}, {"seed": 1}, {"ppo.advantage": "group"}):
         other = Workplace(load_config("smoke", SMALL | changes), work.model_dir, work.folder)
         assert not is_finished([row], other.identity(WORLD_MODEL, ["train"])), changes
+    precise = Workplace(load_config("smoke", SMALL | {"ppo.learning_rate": 1.234567e-4}), work.model_dir, work.folder)
+    row = row_of(work, **{"ppo.learning_rate": 1.234567e-4})
+    assert is_finished([row], precise.identity(WORLD_MODEL, ["train"])), "a file holds five digits"
+    assert precise.rounds != work.rounds, "models that another policy refreshed"
     video = make_stepped_folder(tmp_path / "video_model")
     assert len(work.identity(str(video))["models_sha256"]) == 2
     old = {"model": WORLD_MODEL, "task": "push_cube", "seed": 0, "updates": work.config.ppo.updates}
     assert not is_finished([old], work.identity(WORLD_MODEL, [])), "nobody knows its settings"
+
+
+def test_a_ranking_is_of_its_own_policies_by_these_settings_in_these_models(
+    work: Workplace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither other settings, nor a policy that was trained again since, nor another video model."""
+    weights, file, asked = work.start[1], tmp_path / "rows.json", list[int]()
+
+    def measure(place: Workplace, path: Path, models: list[str]) -> dict[str, Any]:
+        imagined = {model: {"rate": 0.5} for model in models}
+        return {**known_policy(place, path, models), "real": {"rate": 0.5}, "imagined": imagined}
+
+    monkeypatch.setattr(experiments, "measure_policy", measure)
+    monkeypatch.setattr(experiments, "rank_policies", lambda rows, models, seed: asked.append(len(rows)) or {})
+    for settings, models in ((SMALL, ()), (SMALL, ()), (SMALL | {"evaluation.episodes": 3}, ()), (SMALL, ("video",))):
+        videos = tuple(make_stepped_folder(tmp_path / name) for name in models)
+        Ranking(preset="smoke", model_dir=work.model_dir, policies=(weights,), json=file, settings=settings,
+                video_models=videos).run()
+    weights.write_bytes(weights.read_bytes() + b" ")
+    Ranking(preset="smoke", model_dir=work.model_dir, policies=(weights,), json=file, settings=SMALL).run()
+    assert asked == [1] * 5 and len(json.loads(file.read_text(encoding="utf-8"))["rows"]) == 4
+
+
+def test_rows_of_one_seed_are_not_counted_as_several(work: Workplace) -> None:
+    """One was measured in further scenes, too, and one is of a model that was trained anew."""
+    row = row_of(work) | {"task": "push_cube", "seed": 0, "success_before": [0, 1], "success_after": [1, 1]}
+    assert not _over_seeds([row, row | {"scenes": []}, row | {"models_sha256": ["another"]}])
+    assert _over_seeds([row, row | {"seed": 1, "config": row["config"] | {"seed": 1}}])[0][2] == "0, 1"
 
 
 @pytest.mark.slow
@@ -141,7 +176,7 @@ def test_training_in_rounds_refreshes_the_model_and_reads_the_exploit_meter(tmp_
         "--exploit_meter.episodes", "2", "--evaluation.episodes", "2", "--simulation.max_episode_steps", "12",
     ]) == 0
     (row,) = json.loads(file.read_text(encoding="utf-8"))["rows"]
-    (refresh,), folder = row["refreshes"], tmp_path / "work" / "push_cube_0" / "rounds" / "1"
+    (refresh,), (folder,) = row["refreshes"], (tmp_path / "work" / "push_cube_0").glob("rounds_*/rounds/1")
     assert [reading["update"] for reading in row["exploit_meter"]] == [0, 1, 1, 2]
     assert len(row["course"]) == 2 and {entry["name"] for entry in refresh["rows"]} >= {"done signal right"}
     refreshed = load_model_folder(folder / "model").manifest["refreshed"]

@@ -10,6 +10,7 @@ import pytest
 from model_folders import make_model_folder
 
 from benchmarks.environments import roboscape
+from benchmarks.environments.figures import extreme_table
 from benchmarks.environments.policies import Workplace, train_on
 from benchmarks.environments.roboscape import (
     ALL_SCENES,
@@ -115,6 +116,12 @@ def test_every_training_is_made_once_and_measured_in_and_out_of_domain(
     assert main([*words, "--figure", "4"]) == 0 and json.loads(file.read_text(encoding="utf-8"))["rows"] == rows
     strip = cv2.imread(str(tmp_path / "work" / "push_0" / f"push_{OOD[0]}.png"))
     assert strip is not None and len(strip) > len(rows) * 2 * 64  # a row of pictures for each policy
+
+
+def test_the_table_of_extreme_actions_has_every_step_that_was_measured() -> None:
+    metrics = {f"{name}_h{step}": 1.0 for name in ("psnr_shuffled_drop_db", "tool_command_cm") for step in ("01", "40")}
+    table = extreme_table([{"task": "push", "domain": "train", "actions": "extreme", "metrics": metrics}])
+    assert list(table.columns[3].cells) == ["1", "40"]
 
 
 @pytest.mark.slow

@@ -88,7 +88,7 @@ def test_a_table_of_success_labels_is_read_and_has_no_score(bench: Path) -> None
 
 def test_nothing_is_claimed_where_nothing_was_decided() -> None:
     found = success_numbers([True, False], [None, None], [NAN, NAN], 0)
-    assert found["decided"] == 0 and found["accuracy"][1:] == [0, 1]
+    assert found["decided"] == 0 and found["accuracy"][1:] == [0, 1] and np.isnan(found["accuracy"][0])
     assert np.isnan(found["f1"][0]) and np.isnan(found["auroc"]).all()
     assert score_errors([5, 1], [NAN, NAN], 0) == {}
     assert f1([True, True, False, False], [True, False, True, False]) == 0.5

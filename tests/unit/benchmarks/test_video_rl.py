@@ -33,7 +33,8 @@ SHORT = DiscPlan(iterations=2, contexts=1, eval_contexts=4, eval_every=1)
 
 def training(sampler: str, seed: int, *rewards: float) -> dict[str, Any]:
     points = [{"iteration": i, "reward": value, "obeyed": 0.5, "background": 0.001} for i, value in enumerate(rewards)]
-    return {"sampler": sampler, "seed": seed, "evaluations": points}
+    plan = {"iterations": len(rewards) - 1, "eval_every": 1}
+    return {"sampler": sampler, "seed": seed, "plan": plan, "evaluations": points}
 
 
 # intervals
@@ -248,6 +249,15 @@ def test_a_file_of_another_experiment_is_refused(tmp_path: Path, capsys: pytest.
 def test_an_unknown_arm_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["benchmark", "learning", "--samplers", "CPS 7"]) == 2
     assert "unknown samplers CPS 7" in capsys.readouterr().err
+
+
+def test_a_training_that_ends_early_keeps_what_it_reached_to_the_end_of_its_path() -> None:
+    """Of three planned evaluations: 0.5, 1 and then 1 again, not 0.5 and 1 alone."""
+    plan = {"iterations": 15, "eval_every": 5}
+    early, whole = ({"plan": plan, "evaluations": [{"success": one} for one in course]}
+                    for course in ((0.0, 0.5, 1.0), (0.0, 0.5, 1.0, 1.0)))
+    assert value(early, "success_path") == value(whole, "success_path") == pytest.approx(2.5 / 3)
+    assert value(early, "success") == 1
 
 
 def test_a_base_of_another_architecture_and_a_count_of_zero_are_refused(capsys: pytest.CaptureFixture[str]) -> None:

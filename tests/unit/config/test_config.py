@@ -61,6 +61,10 @@ def test_a_changed_copy_is_checked_like_a_preset() -> None:
         ("cpu", {"ppo.speed": 1}, r"unknown setting 'ppo\.speed'; known there: updates, num_envs"),
         ("cpu", {"ppo.updats": 1}, r"unknown setting 'ppo\.updats'; did you mean 'ppo\.updates'\?"),
         ("cpu", {"task": "fly"}, r"task.*push_cube.*'fly'"),
+        ("cpu", {"data.behaviours": {"expert": 0}}, r"data\.behaviours: the shares must add up to more than 0"),
+        ("cpu", {"data.behaviours": {}}, r"data\.behaviours: the shares must add up to more than 0"),
+        ("cpu", {"world_model.rollout_steps": []}, r"world_model\.rollout_steps: List should have at least 1 item"),
+        ("cpu", {"simulation.cameras": []}, r"simulation\.cameras: List should have at least 1 item"),
     ],
 )
 def test_a_wrong_preset_or_setting_is_one_clear_error(preset: str, overrides: dict[str, object], text: str) -> None:

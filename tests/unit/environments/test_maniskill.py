@@ -227,6 +227,8 @@ def test_collection_writes_bags_and_does_not_collect_again(tmp_path: Path) -> No
     other = dataclasses.replace(plan, num_episodes=2)
     assert collect_plan(other, config, tmp_path) == bags
     assert [path.stat().st_mtime_ns for path in sorted(bags[0].iterdir())] == written
+    with pytest.raises(ValueError, match=r"made for fewer episodes: it holds 2, and 3 are wanted; delete it"):
+        collect_plan(dataclasses.replace(plan, num_episodes=3), config, tmp_path)
 
 
 def standing_still(_observation: Observation, _seed: int) -> np.ndarray:  # type: ignore[type-arg]

@@ -1,5 +1,6 @@
 """Acceptance before a training: held-out episodes and the cloned policy's own rollouts, in the real simulator."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,9 +55,20 @@ def test_a_success_that_the_model_sees_too_early_is_real_where_the_robot_holds_s
     np.testing.assert_array_equal(held, imagined)
 
 
-def test_starts_that_the_simulator_does_not_show_are_refused_without_pictures_too() -> None:
+class _Blind(ReachToy):
+    """Without pictures nothing is read off them: one value of the state is not known."""
+
+    def reset(self, mask: BoolArray | None = None, seeds: UInt64Array | None = None) -> Observation:
+        shown = super().reset(mask, seeds)
+        return replace(shown, state=np.where([False, False, True], np.float32(np.nan), shown.state))
+
+
+@pytest.mark.parametrize("simulator", [ReachToy, _Blind])
+def test_starts_that_the_simulator_does_not_show_are_refused_without_pictures_too(simulator: type[ReachToy]) -> None:
+    policy, model = make_policy(load_config("smoke")), ToyModel(4, 0)
+    imagine_and_replay(policy, model, simulator(1, 0), SEEDS, 0)
     with pytest.raises(ValueError, match="first frames are not what the simulator shows"):
-        imagine_and_replay(make_policy(load_config("smoke")), ToyModel(4, 0), ReachToy(1, 0), SEEDS[::-1].copy(), 0)
+        imagine_and_replay(policy, model, simulator(1, 0), SEEDS[::-1].copy(), 0)
 
 
 @pytest.mark.slow

@@ -330,6 +330,19 @@ def test_an_untrained_model_does_not_pass(untrained: WorldModels, heldout: Episo
     assert {"object_rollout_cm_h01", "object_rollout_cm_h08", "tool_floor_cm_h12"} <= report.metrics.keys()
 
 
+def test_episodes_of_more_than_64_steps_are_judged_by_their_last_one(
+    untrained: WorldModels, heldout: EpisodeArrays
+) -> None:
+    first = heldout.select([0, 1])
+    parts = {name: getattr(first, name) for name in ("images", "states", "actions", "ground_truth", "success")}
+    six = {name: np.concatenate([part[:, :12]] * 6, 1) for name, part in parts.items()}
+    frames = {name: np.concatenate([six[name], parts[name][:, -1:]], 1) for name in six if name != "actions"}
+    long = replace(first, **frames, actions=six["actions"], lengths=first.lengths * 0 + 72)
+    report = accept_world_model(untrained, long, settings())
+    values = {row.name: row.value for row in report.criteria}
+    assert all(np.isfinite(values[f"{thing} error / copying, step 72"]) for thing in ("object", "tool"))
+
+
 def test_episodes_without_ground_truth_are_refused(untrained: WorldModels, heldout: EpisodeArrays) -> None:
     unknown = heldout.ground_truth.copy()
     unknown[2] = np.nan

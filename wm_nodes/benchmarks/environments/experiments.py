@@ -17,11 +17,12 @@ from benchmarks.environments.policies import (
     SIMULATOR_ENVS,
     WORLD_MODEL,
     Workplace,
+    known_policy,
     measure_policy,
     rank_policies,
     train_in,
 )
-from benchmarks.experiment import Experiment, console
+from benchmarks.experiment import Experiment, console, rounded
 from wm_nodes.apps import options
 from wm_nodes.config.load import load_config
 from wm_nodes.config.object_state import with_reader
@@ -29,6 +30,7 @@ from wm_nodes.config.scenes import check_scenes
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.device import compute_device
+from wm_nodes.core.files import file_sha256
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.statistics import bootstrap_mean, paired_difference
 from wm_nodes.environments.registry import make_environment
@@ -133,15 +135,18 @@ class Ranking(InModels):
 
     def run(self) -> None:
         rows, workplace, models = self.read(), self.workplace(self.task, self.seed), self.models
+        ranked = list[dict[str, Any]]()
         for path in tqdm(self.policies, desc="policies", unit="policy"):
-            wanted = {"policy": str(path), "config": workplace.config.model_dump(mode="json")}
-            if not is_finished([row for row in rows if set(models) <= row["imagined"].keys()], wanted):
-                rows.append(measure_policy(workplace, path, models))
+            wanted = known_policy(workplace, path, models)
+            if not (found := [row for row in rows if is_finished([row], wanted)]):
+                found = [measure_policy(workplace, path, models)]
+                rows += found
                 self.write({"rows": rows})
-        correlations = rank_policies(rows, models, self.seed)
+            ranked += found[:1]
+        correlations = rank_policies(ranked, models, self.seed)
         self.write({"rows": rows, "correlations": correlations})
         console.print(make_table(
-            f"imagined against real success of {len(rows)} policies", ("model", "rank correlation", "95 %"),
+            f"imagined against real success of {len(ranked)} policies", ("model", "rank correlation", "95 %"),
             [(model, f"{one['correlation']:+.2f}", f"{one['low']:+.2f} to {one['high']:+.2f}")
              for model, one in correlations.items()],
         ))
@@ -163,6 +168,8 @@ class Measured(Configured):
         config, rows = load_config(self.preset, {"task": self.task, **self.settings}), self.read()
         policy = str(self.weights or config.policy.factory or "untrained")
         wanted: dict[str, Any] = {"policy": policy, "config": config.model_dump(mode="json")}
+        if self.weights:
+            wanted["sha256"] = file_sha256(self.weights)
         if not is_finished(rows, wanted):
             rows.append({**wanted, **self._measured(config)})
             self.write({"rows": rows}, device=config.device)
@@ -197,8 +204,9 @@ class Measured(Configured):
 
 
 def is_finished(rows: Sequence[Mapping[str, Any]], wanted: Mapping[str, Any]) -> bool:
-    """Whether one of the rows has all of the wanted values."""
-    return any(all(row.get(name) == value for name, value in wanted.items()) for row in rows)
+    """Whether one of the rows has all of the wanted values, up to the digits that a file holds."""
+    asked = rounded(wanted)
+    return any(rounded({name: row.get(name) for name in asked}) == asked for row in rows)
 
 
 def _outcome(row: dict[str, Any]) -> str:
@@ -219,10 +227,12 @@ def _lines(row: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def _over_seeds(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
-    """A line for each model and task of the same settings with several seeds: the difference over all episodes."""
+    """A line for each model and task of the same settings with several seeds: the difference over all episodes. Rows
+    that were measured in other scenes, too, are others: of one seed they hold the same episodes."""
     groups = dict[str, list[dict[str, Any]]]()
     for row in rows:
-        groups.setdefault(json.dumps([row["model"], {**row["config"], "seed": ""}]), []).append(row)
+        same = [row.get(name) for name in ("model", "models_sha256", "scenes")], {**row["config"], "seed": ""}
+        groups.setdefault(json.dumps(same), []).append(row)
     lines = list[tuple[str, ...]]()
     for of in groups.values():
         if len(of) > 1:

@@ -23,7 +23,6 @@ from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.film_strip import film_strip
 from wm_nodes.world_model.validation.controllability import controllability_metrics
-from wm_nodes.world_model.validation.open_loop import HORIZONS
 
 SCRIPTED = "scripted"
 """The configured behaviours, the control of EXTREME."""
@@ -68,7 +67,7 @@ def measure_extreme(config: RunConfig, model_dir: Path, work: Path) -> Iterator[
         )
         folder = work.absolute() / f"{config.task}_{domain}_{name}"
         bags = collect_plan(task_plan(chosen, count, HELDOUT.take(count)), chosen, folder)
-        episodes = [episode for bag in bags for episode in read_episodes(bag)]
+        episodes = [episode for bag in bags for episode in read_episodes(bag)][:count]  # earlier calls may want more
         pair = side_by_side(models, episodes[:1], config)[0]
         film_strip(pair.rows, folder / "film_strip.png", marks=pair.done)
         found = controllability_metrics(models, stack_episodes(episodes, [config.task]), models.spec)
@@ -78,11 +77,12 @@ def measure_extreme(config: RunConfig, model_dir: Path, work: Path) -> Iterator[
 
 def extreme_table(rows: Iterable[dict[str, Any]]) -> Table:
     """Of the rows of measure_extreme, at every horizon that they have."""
+    first, *others = "psnr_shuffled_drop_db_h", "tool_command_cm_h", "tool_shuffled_cm_h"
     lines = [
-        (row["task"], row["domain"], row["actions"], str(horizon),
-         *(shown(row["metrics"].get(f"{name}_h{horizon:02d}")) for name in
-           ("psnr_shuffled_drop_db", "tool_command_cm", "tool_shuffled_cm")))
-        for row in rows for horizon in HORIZONS if f"psnr_shuffled_drop_db_h{horizon:02d}" in row["metrics"]
+        (row["task"], row["domain"], row["actions"], str(int(step)), shown(drop),
+         *(shown(row["metrics"].get(f"{name}{step}")) for name in others))
+        for row in rows for metric, drop in row["metrics"].items() if metric.startswith(first)
+        for step in [metric.removeprefix(first)]
     ]
     return make_table(
         "rollouts of extreme actions",

@@ -3,11 +3,13 @@
 A model is the task's world model, or a video model that can be stepped, given by its folder.
 """
 
+import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from hashlib import sha256
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -80,6 +82,12 @@ class Workplace:
         folder = self.model_dir if model == WORLD_MODEL else Path(model)
         count = num_envs or self.config.ppo.num_envs
         return make(self.config, folder, self.start[0], num_envs=count, seed=self.config.seed)
+
+    @property
+    def rounds(self) -> Path:
+        """Folder of the rounds by these settings in this model: others refresh it on episodes of another policy."""
+        made_of = json.dumps(self.identity(WORLD_MODEL), sort_keys=True)
+        return self.folder / f"rounds_{sha256(made_of.encode()).hexdigest()[:8]}"
 
     @contextmanager
     def simulator(self, scenes: str = "", num_envs: int = SIMULATOR_ENVS) -> Iterator[Environment]:
@@ -234,7 +242,7 @@ def _train_in_rounds(workplace: Workplace, policy: ImagePolicy, note: Callable[[
         weights = part.folder / "policy.safetensors"
         weights.parent.mkdir(parents=True, exist_ok=True)
         save_weights(policy, weights, {"tokenizer_sha256": policy.encoder.sha256})
-        decision = refresh_round(config, part.model_dir, weights, first_frames, workplace.folder, part.number)
+        decision = refresh_round(config, part.model_dir, weights, first_frames, workplace.rounds, part.number)
         rounds.refreshes.append(decision.to_dict())
         return decision.accepted
 
@@ -243,19 +251,24 @@ def _train_in_rounds(workplace: Workplace, policy: ImagePolicy, note: Callable[[
         def simulator() -> Environment:
             return stack.enter_context(workplace.simulator())
 
-        run_rounds(config, workplace.folder, workplace.model_dir, first_frames, train)
+        run_rounds(config, workplace.rounds, workplace.model_dir, first_frames, train)
     return rounds
+
+
+def known_policy(workplace: Workplace, weights: Path, models: Sequence[str]) -> dict[str, Any]:
+    """What a row of the ranking is known by: every setting, the policy, and the models."""
+    return {
+        "policy": str(weights), "sha256": file_sha256(weights), "config": workplace.config.model_dump(mode="json"),
+        "models_sha256": {model: workplace.identity(model)["models_sha256"] for model in models},
+    }
 
 
 def measure_policy(workplace: Workplace, weights: Path, models: Sequence[str]) -> dict[str, Any]:
     """Success of a policy in the simulator and in each model, its row of the ranking."""
     policy = workplace.policy(weights)
     imagined = {model: rate_of(workplace.imagined(policy, workplace.environment(model))) for model in models}
-    return {
-        "policy": str(weights), "sha256": file_sha256(weights), "config": workplace.config.model_dump(mode="json"),
-        "real": rate_of(workplace.real(policy)),
-        "imagined": imagined,
-    }
+    known = known_policy(workplace, weights, models)
+    return {**known, "real": rate_of(workplace.real(policy)), "imagined": imagined}
 
 
 def rank_policies(rows: Sequence[dict[str, Any]], models: Sequence[str], seed: int) -> dict[str, dict[str, float]]:

@@ -123,7 +123,8 @@ def imagined_episodes(
         data=config.data.with_values(behaviours=BEHAVIOURS),
     )
     bags = collect_plan(task_plan(chosen, count, first), chosen, work.absolute() / f"{config.task}_{domain}_{first}")
-    episodes = (episode for bag in bags for episode in read_episodes(bag))
+    recorded = (episode for bag in bags for episode in read_episodes(bag))
+    episodes = itertools.islice(recorded, count)  # an earlier call may have wanted more
     return imagine_all(models, stack_episodes(episodes, [config.task]), config.task)
 
 

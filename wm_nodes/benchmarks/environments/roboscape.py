@@ -127,6 +127,8 @@ class RoboScape(Configured):
         for task, seed, training in tqdm(cells, desc="cells", unit="cell"):
             place, own = workplace(self, self.work, task, seed, training)
             wanted = {**place.identity(SIMULATOR, (own, *OOD)), "model": training, "task": task, "seed": seed}
+            if training in LEARNED:
+                wanted["learned_from"] = self.learned_from
             shown += self.once(wanted, partial(_cell, place, training, own, self.learned_from, self.work))
         self._show(shown, trainings)
         if self.figure == "4":
@@ -229,7 +231,7 @@ def _cell(
 def _refreshed(workplace: Workplace) -> tuple[Workplace, RefreshDecision]:
     """The same with a model that went on learning from the clone's episodes in the simulator (model_refresh), and how
     it compares with the old one; it is taken in either case."""
-    config, folder, (starts, weights) = workplace.config, workplace.folder, workplace.start
+    config, folder, (starts, weights) = workplace.config, workplace.rounds, workplace.start
     decision = refresh_round(config, workplace.model_dir, weights, starts, folder, 1)
     return replace(workplace, model_dir=round_folder(folder, 1) / "model"), decision
 

@@ -25,7 +25,7 @@ from wm_nodes.config.load import load_config
 from wm_nodes.core.files import text_lines
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.core.statistics import auroc, bootstrap_mean, wilson_interval
+from wm_nodes.core.statistics import auroc, bootstrap_mean, wilson_of_share
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.clip_files import ClipLine, read_job
 from wm_nodes.judge.decisions import accepts
@@ -150,10 +150,9 @@ def success_numbers(success: Sequence[bool], accepted: Answers, rewards: Sequenc
     """Accuracy and F1 over decided clips, AUROC over clips with a reward (else NaN); [value, low, high] of 95 %."""
     truth, said, paid = np.array(success, bool), np.array(accepted, bool), ~np.isnan(rewards)
     known = np.array([answer is not None for answer in accepted], bool)
-    right = int((truth == said)[known].sum())
     return {
         "decided": int(known.sum()),
-        "accuracy": [right / max(1, known.sum()), *wilson_interval(right, int(known.sum()))],
+        "accuracy": [*wilson_of_share((truth == said)[known])],
         "f1": _bootstrapped(f1, truth[known], said[known], seed),
         "auroc": _bootstrapped(auroc, truth[paid], np.array(rewards)[paid], seed),
     }

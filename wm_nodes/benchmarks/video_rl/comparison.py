@@ -32,8 +32,8 @@ class SamplerComparison:
 def compare_samplers(
     rows: Sequence[dict[str, Any]], sampler: str, base: str, measures: Sequence[str] = MEASURES
 ) -> SamplerComparison | None:
-    """Compare trainings, whose rows hold `sampler`, `seed` and `evaluations`, the first one of before; None where the
-    two have fewer than two seeds in common."""
+    """Compare trainings, whose rows hold `sampler`, `seed`, `plan` and `evaluations`, the first one of before; None
+    where the two have fewer than two seeds in common."""
     of = {name: {row["seed"]: row for row in rows if row["sampler"] == name} for name in (sampler, base)}
     seeds = sorted(of[sampler].keys() & of[base].keys())
     if len(seeds) < 2:
@@ -52,8 +52,12 @@ def gains(rows: Sequence[dict[str, Any]], measure: str) -> list[list[float]]:
 
 
 def value(row: dict[str, Any], measure: str) -> float:
-    """One number of one training, e.g. `reward`, or `reward_path`; see PATH."""
+    """One number of one training, e.g. `reward`, or `reward_path`; see PATH. One that ended early, as nothing was left
+    to learn, stays what it was by then."""
     evaluations, name = row["evaluations"], measure.removesuffix(PATH)
-    if name != measure:
-        return float(np.mean([evaluation[name] for evaluation in evaluations[1:]]))
-    return float(evaluations[-1][measure])
+    last = float(evaluations[-1][name])
+    if name == measure:
+        return last
+    reached, planned = [evaluation[name] for evaluation in evaluations[1:]], row["plan"]
+    missing = -(-planned["iterations"] // planned["eval_every"]) - len(reached)
+    return float(np.mean([*reached, *[last] * missing]))

@@ -17,7 +17,7 @@ from benchmarks.video_rl.comparison import CLIP_MEASURES, SamplerComparison
 from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.samplers import LearningPlan, clip_learning_samplers
 from benchmarks.video_rl.sources import TASK, RecordedSource, config_of, recorded_episodes
-from benchmarks.video_rl.trainings import OnIteration, Trainings
+from benchmarks.video_rl.trainings import OnIteration, Trainings, recordings_of
 from benchmarks.video_rl.trials import SamplerTrial
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.seed_ranges import HELDOUT, NEW_CONTEXTS
@@ -57,7 +57,9 @@ class ClipLearning(Trainings[LearningPlan]):
         return [SamplerTrial(sampler, plan) for sampler in clip_learning_samplers()]
 
     def base(self) -> dict[str, Any]:
-        return {"sha256": load_video_folder(self.video_model).manifest["sha256"]}
+        recordings = {"new": 0 if self.context_bags else self.contexts,
+                      **recordings_of(self.context_bags, self.heldout_bags)}
+        return {"sha256": load_video_folder(self.video_model).manifest["sha256"], "recordings": recordings}
 
     def train(self, trial: SamplerTrial[LearningPlan], seed: int, on_iteration: OnIteration) -> dict[str, Any]:
         folder, probe = load_video_folder(self.video_model, self.where), load_probe(shipped_model(TASK), self.where)

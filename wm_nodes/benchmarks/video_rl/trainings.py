@@ -16,6 +16,7 @@ from benchmarks.video_rl.samplers import SamplerSetup
 from benchmarks.video_rl.trials import Plan, SamplerTrial
 from wm_nodes.apps.options import prepare_torch
 from wm_nodes.core.progress import tqdm
+from wm_nodes.training.contents import content_of
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 
@@ -47,7 +48,7 @@ class Trainings(OnDevice, Generic[Plan]):
         raise NotImplementedError
 
     def base(self) -> dict[str, Any]:
-        """Which model training begins with."""
+        """Which model training begins with, and which recordings it has."""
         raise NotImplementedError
 
     def pairs(self, rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
@@ -131,7 +132,8 @@ class RecordedTrainings(Trainings[Plan]):
     """Of every sampler, to choose one; without, the chosen ones."""
 
     def base(self) -> dict[str, Any]:
-        return {"sha256": self.folder().manifest["sha256"]}
+        recordings = recordings_of(self.context_bags, self.heldout_bags)
+        return {"sha256": self.folder().manifest["sha256"], "recordings": recordings}
 
     def folder(self) -> VideoFolder:
         return load_video_folder(self.video_model, self.where)
@@ -146,6 +148,12 @@ class RecordedTrainings(Trainings[Plan]):
         if not self.learning_rate:
             return setups
         return [replace(one, grpo=one.grpo.with_values(learning_rate=self.learning_rate)) for one in setups]
+
+
+def recordings_of(context_bags: Sequence[Path], heldout_bags: Sequence[Path]) -> dict[str, list[str]]:
+    """What bags are known by: their content, for they may be moved."""
+    both = {"contexts": context_bags, "heldout": heldout_bags}
+    return {name: [content_of(str(bag)) or str(bag) for bag in bags] for name, bags in both.items()}
 
 
 def training_name(sampler: str, seed: int) -> str:

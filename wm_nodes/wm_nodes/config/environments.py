@@ -27,7 +27,7 @@ class SimulationConfig(SettingsSection):
     scenes: ScenesName = ""
     """Of which scenes an episode has one, by its reset seed: a split of config/scenes.json, or one scene's name. Empty:
     the task has a scene of its own."""
-    cameras: list[Literal["side", "near", "front", "wrist"]]
+    cameras: Annotated[list[Literal["side", "near", "front", "wrist"]], Field(min_length=1)]
     """Rendered side by side, left to right, in every observation."""
     image_size: PositiveInt
     """Height and width of one camera image, px."""

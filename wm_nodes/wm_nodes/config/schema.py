@@ -3,6 +3,7 @@
 Loop 2's are in video.py.
 """
 
+import math
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
@@ -37,6 +38,12 @@ DeviceName = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 """Where models compute: cpu, cuda, cuda:N, or auto (a GPU where there is one), see core/device.py."""
 
 
+def _with_a_share(behaviours: dict[str, float]) -> dict[str, float]:
+    if not 0 < sum(behaviours.values()) < math.inf:
+        raise ValueError("the shares must add up to more than 0, and to a number; give one behaviour at least")
+    return behaviours
+
+
 class DataConfig(SettingsSection):
     num_episodes: Annotated[int, Field(ge=1, le=250_000)]
     """Simulator episodes to collect for the world model."""
@@ -45,7 +52,7 @@ class DataConfig(SettingsSection):
     tokenizer and probes see them, and learn from them where things are."""
     num_heldout: Annotated[int, Field(ge=1, le=100_000)]
     """Episodes kept apart for the acceptance of the world model; never trained on."""
-    behaviours: dict[str, NonNegativeFloat]
+    behaviours: Annotated[dict[str, NonNegativeFloat], AfterValidator(_with_a_share)]
     """Relative share of each behaviour (expert, noisy, near_miss, biased, waypoint, random, reach, ...)."""
     num_workers: PositiveInt
     """Collecting processes."""
@@ -121,7 +128,7 @@ class WorldModelConfig(SettingsSection):
     """Of the action model; the text model takes half of it."""
     condition_map: NonNegativeInt = 0
     """Hidden width of the MLP by which every token's input depends on the whole action and pose; 0: none (not lfq)."""
-    rollout_steps: list[PositiveInt]
+    rollout_steps: Annotated[list[PositiveInt], Field(min_length=1)]
     """Curriculum: imagined steps unrolled and back-propagated through, raised in equal stages over the training."""
     part_steps: NonNegativeInt = 0
     """Steps of the random parts of episodes that the action model is rolled out over in training; 0: whole episodes."""

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -101,9 +102,18 @@ def first_frames_plan(config: RunConfig, num_episodes: int, seeds: SeedRange = S
 
 
 def collect_plan(plan: CollectionPlan, config: RunConfig, folder: Path) -> list[Path]:
-    """Collect the plan's episodes into bags below `folder`, see collect, and list them in its index.csv."""
+    """Collect the plan's episodes into bags below `folder`, see collect, and list them in its index.csv.
+
+    Raises:
+        ValueError: a bag is there that an earlier call for fewer episodes left short.
+    """
     bags = collect(folder, plan, write_shard, num_workers=config.data.num_workers)
-    write_index(folder)
+    held = Counter(row["bag"] for row in write_index(folder))
+    for number, bag in enumerate(bags):
+        wanted = min(collection.EPISODES_PER_SHARD, plan.num_episodes - number * collection.EPISODES_PER_SHARD)
+        if held[bag.name] < wanted:
+            raise ValueError(f"{bag} was made for fewer episodes: it holds {held[bag.name]}, and {wanted} are wanted; "
+                             "delete it to have it made again")
     return bags
 
 
@@ -151,13 +161,14 @@ def read_index(bags: Sequence[Path]) -> list[dict[str, Any]]:
     return [{name: row[name] for name in INDEX_COLUMNS} for row in rows]
 
 
-def write_index(folder: Path) -> None:
-    """Write index.csv, what read_index finds in the complete bags of the folder."""
-    text = io.StringIO()
+def write_index(folder: Path) -> list[dict[str, Any]]:
+    """Write index.csv, what read_index finds in the complete bags of the folder, and return it."""
+    text, rows = io.StringIO(), read_index(sorted(path for path in folder.glob("shard_*") if not path.suffix))
     writer = csv.DictWriter(text, INDEX_COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(read_index(sorted(path for path in folder.glob("shard_*") if not path.suffix)))
+    writer.writerows(rows)
     write_atomic(folder / INDEX, text.getvalue().encode())
+    return rows
 
 
 def success_table(rows: Sequence[Mapping[str, Any]], *by: str) -> str:

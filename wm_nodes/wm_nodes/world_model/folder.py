@@ -81,7 +81,7 @@ def save_model_folder(
     config: RunConfig, *, spec: EnvironmentSpec, tasks: tuple[str, ...], story: Mapping[str, Any],
     probe: PositionProbe | None = None, decoder: nn.Module | None = None, reader: nn.Module | None = None,
 ) -> Path:
-    """Write the models, made with `config`, as float16 (what is `exact` as float32), and the manifest.
+    """Write the models, made with `config`, as float16 (buffers, and what is `exact`, as float32), and the manifest.
 
     Args:
         spec: of the environment whose episodes the models were trained on.
@@ -212,13 +212,12 @@ def _load(folder: Path, key: str, module: nn.Module, manifest: Mapping[str, Any]
 
 
 def _pack(module: nn.Module) -> bytes:
-    """Return a module's weights as safetensors: float16, those of parts that are `exact` as they are."""
+    """Return a module's weights as safetensors: float16, those of parts that are `exact` as they are, and so the
+    buffers: shift and scale of states and positions have any unit, and in float16 lose what they differ by."""
     tensors = {name: tensor.detach().cpu() for name, tensor in module.state_dict().items()}
     exact = tuple(f"{name}." for name, part in module.named_modules() if getattr(part, "exact", False))
-    data: bytes = save({
-        name: (t.half() if t.is_floating_point() and not name.startswith(exact) else t).contiguous()
-        for name, t in tensors.items()
-    })
+    halved = {name for name, _ in module.named_parameters() if not name.startswith(exact)}
+    data: bytes = save({name: (t.half() if name in halved else t).contiguous() for name, t in tensors.items()})
     return data
 
 

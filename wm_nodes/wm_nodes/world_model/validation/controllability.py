@@ -17,7 +17,7 @@ from wm_nodes.reward.picture_similarity import psnr_db
 from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.positions import columns_of
 from wm_nodes.world_model.training.tokenizer import episode_targets
-from wm_nodes.world_model.validation.open_loop import HORIZONS, imagine_episodes, position_reader
+from wm_nodes.world_model.validation.open_loop import horizons_up_to, imagine_episodes, position_reader
 
 
 def controllability_metrics(
@@ -45,7 +45,7 @@ def controllability_metrics(
         if tool:
             errors[name] = 100 * np.linalg.norm(read(frames[name])[..., tool] - wanted, axis=-1)
     metrics = dict[str, float]()
-    for horizon in sorted({min(h, episodes.num_steps) for h in HORIZONS}):
+    for horizon in horizons_up_to(episodes.num_steps):
         rows = np.minimum(episodes.lengths, np.roll(episodes.lengths, 1)) >= horizon
         if not rows.any():
             continue

@@ -32,6 +32,7 @@ from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.tokenizer import episode_targets
 
 HORIZONS = (1, 2, 4, 8, 12, 16, 32, 64)
+"""Steps after which rollouts are compared, beside the last one; see horizons_up_to."""
 EARLY_STEPS, EARLY_SHARE = 3, 0.25
 """By how many steps, or which share of the episode if that is more, a done signal in time may precede the success."""
 MOVED_M = 0.01
@@ -51,6 +52,11 @@ class ImaginedEpisodes:
     """float32 (E, T, J)."""
     states: FloatArray
     """float32 (E, T, S), of frames 1..T; measured values as the model predicts them."""
+
+
+def horizons_up_to(num_steps: int) -> list[int]:
+    """HORIZONS of an episode of num_steps steps, and its last step, by which a model is judged."""
+    return sorted({*(step for step in HORIZONS if step < num_steps), num_steps})
 
 
 @torch.inference_mode()
@@ -146,7 +152,7 @@ def evaluate_rollouts(
             real, predicted = read(episodes.images), read(imagined.frames)
         moved = np.linalg.norm(truth[:, -1, thing] - truth[:, 0, thing], axis=-1) > MOVED_M
         metrics["moved_share"] = float(moved.mean())
-    for horizon in sorted({min(h, episodes.num_steps) for h in HORIZONS}):
+    for horizon in horizons_up_to(episodes.num_steps):
         rows = episodes.lengths >= horizon
         if not rows.any():
             continue

@@ -22,7 +22,12 @@ from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.validation.acceptance_report import at_step
 from wm_nodes.world_model.validation.controllability import under_actions
-from wm_nodes.world_model.validation.open_loop import BATCH, HORIZONS, ImaginedEpisodes, imagine_episodes
+from wm_nodes.world_model.validation.open_loop import (
+    BATCH,
+    ImaginedEpisodes,
+    horizons_up_to,
+    imagine_episodes,
+)
 
 VARIES = 0.04
 """A pixel varies between episodes whose standard deviation, of [0, 1], is above this: less may be noise."""
@@ -50,7 +55,7 @@ def picture_metrics(models: WorldModels, imagined: ImaginedEpisodes, episodes: E
     first = episodes.images[:, 0]
     decoded = _in_batches(tokenizer.decode, _in_batches(tokenizer.encode, first)).cpu().numpy()
     metrics = {"varying_error_h00": varying_error(decoded, first)}
-    for horizon in sorted({min(h, episodes.num_steps) for h in HORIZONS}):
+    for horizon in horizons_up_to(episodes.num_steps):
         rows = np.flatnonzero(episodes.lengths >= horizon)
         if not len(rows):
             continue
