@@ -144,15 +144,19 @@ def ppo_settings() -> Rows:
 
 
 def clones() -> Rows:
+    """States are of the shipped model alone."""
     found = read(CLONES)["rows"]
-    for task, seen in product(CLONED, get_args(PolicyInputs)):
-        of = [row for row in found if (row["task"], row["config"]["policy"]["inputs"]) == (task, seen)]
+    shipped = next(row["models_sha256"] for row in found if row["config"]["policy"]["inputs"] == "state")
+    for task, seen, former in product(CLONED, get_args(PolicyInputs), (False, True)):
+        of = [row for row in found if (row["task"], row["config"]["policy"]["inputs"]) == (task, seen)
+              and (row["models_sha256"] != shipped) == former]
         for count in sorted({row["config"]["sft"]["num_demonstrations"] for row in of}):
             its = [row for row in of if row["config"]["sft"]["num_demonstrations"] == count]
             late, early = ([row for row in its if bool(row["config"]["sft"]["heldout"]) == held]
                            for held in (False, True))
             yield (
-                task, seen, count, ", ".join(str(row["seed"]) for row in late),
+                task, f"{seen}, former model" if former else seen, count,
+                ", ".join(str(row["seed"]) for row in late),
                 *(by_seed([100 * row["success"][split]["rate"] for row in rows]) if rows else ""
                   for rows in (late, early) for split in splits()),
             )
