@@ -187,6 +187,19 @@ def test_moved_demonstrations_are_given_anew_and_others_refused(
     assert opened(run)[1] == config, "the record has the new paths"
 
 
+def test_recordings_that_a_setting_names_are_found_from_another_working_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train_policy, "read_spec", lambda path: None)
+    (tmp_path / "bag").mkdir()
+    monkeypatch.chdir(tmp_path)
+    run = ["--run-dir", tmp_path / "run"]
+    _, config = opened([*BEGINNING, "--sft.bags", "[bag]", *run])
+    assert yaml.safe_load(config)["sft"]["bags"] == [str(tmp_path / "bag")]
+    monkeypatch.chdir("/")
+    assert opened(run)[1] == config == opened(["--demos", tmp_path / "bag", *run])[1]
+
+
 def test_one_file_holds_the_settings_and_the_options_and_its_settings_are_those_of_the_run(tmp_path: Path) -> None:
     _, config = opened([*BEGINNING, "--run-dir", tmp_path / "run"])
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["config.yaml"]

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from wm_nodes.config.load import POLICY, VIDEO, Config, judge_overrides, preset_names
+from wm_nodes.config.load import POLICY, VIDEO, Config, judge_overrides, preset_names, with_full_paths
 from wm_nodes.config.tasks import task_names
 from wm_nodes.core.memory import keep_freed_memory
 from wm_nodes.launching.scenarios import PAGE
@@ -126,7 +126,8 @@ def positive(text: str) -> int:
 def judge_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     """The dotted settings that the options of add_judge stand for, and those of the judge that were given as such."""
     named = judge_overrides(arguments.judge, arguments.judge_model, arguments.judge_key_env, arguments.rubric)
-    return named | {name: value for name, value in arguments.settings.items() if name.startswith("judge.")}
+    typed = with_full_paths(arguments.settings)
+    return named | {name: value for name, value in typed.items() if name.startswith("judge.")}
 
 
 def settings(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -134,7 +135,7 @@ def settings(arguments: argparse.Namespace) -> dict[str, Any]:
     named = ("seed", "task") if arguments.settings_of == VIDEO else ("seed",)
     given = {name: getattr(arguments, name, None) for name in named}
     return {
-        **arguments.settings, **device_settings(arguments),
+        **with_full_paths(arguments.settings), **device_settings(arguments),
         **{name: value for name, value in given.items() if value is not None},
     }
 

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import ValidationError
 
+from wm_nodes.config.environments import TRUTH
 from wm_nodes.config.judge import JudgeConfig
 from wm_nodes.config.schema import AGENT, EXECUTION, RunConfig
 from wm_nodes.config.sections import SettingsSection
@@ -26,6 +27,8 @@ POLICY, VIDEO = "policy", "video"
 SCHEMAS: dict[str, type[RunConfig] | type[VideoRlConfig]] = {POLICY: RunConfig, VIDEO: VideoRlConfig}
 FREE = ("behaviours", "rewards", "extra_body", "kwargs", "cameras")
 """Mappings without fixed keys, which are replaced as a whole."""
+PATHS = ("sft.bags", "judge.folder", "simulation.object_state")
+"""Settings that name files or folders."""
 RECORD = "run"
 """Section of a run's config.yaml that is no setting: training/run_record.py keeps there what else decides the run."""
 EMBEDDED = "embedded"
@@ -87,6 +90,17 @@ def reward_overrides(reward: str | None) -> dict[str, Any]:
 def named_pack(rubric: str) -> str:
     """A rubric pack by its name, or by its file's full path, which holds in another working directory too."""
     return str(Path(rubric).absolute()) if rubric and Path(rubric).is_file() else rubric
+
+
+def with_full_paths(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Dotted settings, those of PATHS by their full paths, which hold in another working directory too."""
+    def full(value: Any) -> Any:
+        if isinstance(value, list):
+            return [full(part) for part in value]
+        is_path = isinstance(value, str) and value not in ("", TRUTH)
+        return str(Path(value).expanduser().absolute()) if is_path else value
+
+    return {name: full(value) if name in PATHS else value for name, value in settings.items()}
 
 
 def judge_overrides(endpoints: str = "", model: str = "", api_key_env: str = "", rubric: str = "") -> dict[str, Any]:

@@ -18,6 +18,7 @@ from wm_nodes.config.load import (
     parse_value,
     read_yaml,
     reward_overrides,
+    with_full_paths,
     with_judge,
 )
 from wm_nodes.config.schema import AGENT, RunConfig
@@ -118,7 +119,7 @@ def _starter(scenario: str) -> Starter[Any]:
 def _settings(scenario: str, given: Mapping[str, str]) -> dict[str, Any]:
     """The dotted settings that the arguments stand for."""
     typed = [name for name, value in given.items() if is_setting(name) or (name == "seed" and value)]
-    settings = {name: parse_value(name, given[name]) for name in typed}
+    settings = with_full_paths({name: parse_value(name, given[name]) for name in typed})
     settings |= {name: given[name] for name in ("task", "device") if name in given and (given[name] or name == "task")}
     settings |= judge_overrides(*(given.get(name, "") for name in JUDGE))
     if scenario_of(scenario).loop == VIDEO and (reward := given.get("reward")):
