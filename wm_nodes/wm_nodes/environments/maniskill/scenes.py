@@ -128,8 +128,8 @@ def render(scene: BaseEnv, cameras: Sequence[str]) -> np.ndarray[Any, np.dtype[n
 
 
 def _control_frequency(control_hz: float) -> int:
-    if SIMULATION_HZ % control_hz:
-        raise ValueError(f"simulation.control_hz must divide {SIMULATION_HZ}, got {control_hz}")
+    if control_hz % 1 or SIMULATION_HZ % control_hz:
+        raise ValueError(f"simulation.control_hz must be a whole number that divides {SIMULATION_HZ}, got {control_hz}")
     return int(control_hz)
 
 
