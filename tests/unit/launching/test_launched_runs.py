@@ -147,7 +147,7 @@ def test_an_unnamed_judge_is_the_embedded_one(tmp_path: Path, model: str) -> Non
     for _ in range(2):
         launch_arguments.begin("judge_clips", given)
     named = {"judge": "http://a/v1", "judge_model": "judge"}
-    assert "judge is [] in this run" in refused("judge_clips", {**given, **named})
+    assert "judge is 'embedded' in this run" in refused("judge_clips", {**given, **named})
 
 
 def test_loop_2_goes_on_with_its_own_settings(tmp_path: Path, model: str) -> None:
@@ -160,7 +160,7 @@ def test_loop_2_goes_on_with_its_own_settings(tmp_path: Path, model: str) -> Non
     assert launch_arguments.begin("world_model_rl", {**begun, **run_in(tmp_path)})[0] == first
     assert "preset is 'smoke'" in refused("world_model_rl", {**run_in(tmp_path), "preset": "base"})
     assert "context_bags is '/a,/b'" in refused("world_model_rl", {**run_in(tmp_path), "context_bags": "/a"})
-    assert "judge is [] in this run" in refused("world_model_rl", {**run_in(tmp_path), "judge": "http://a/v1"})
+    assert "judge is 'embedded' in this run" in refused("world_model_rl", {**run_in(tmp_path), "judge": "http://a/v1"})
     assert "unknown setting 'iterations'" in refused("evaluate", run_in(tmp_path))
     weighed = {**begun, "rewards.closeness": "0.5", "run_dir": str(tmp_path / "weighed")}
     launch_arguments.begin("world_model_rl", weighed)

@@ -399,7 +399,9 @@ def test_a_server_that_lists_its_models_otherwise_or_not_at_all_is_told_and_noth
     listing: str, served: list[list[str]]
 ) -> None:
     class Listing(ChatServer):
-        async def _send(self, writer: asyncio.StreamWriter, status: int, text: str, *more: Any) -> None:
+        async def _send(
+            self, writer: asyncio.StreamWriter, status: int, text: str, extra: str = "", length: int | None = None
+        ) -> None:
             await super()._send(writer, status, listing)
 
     async def steps(transport: ChatTransport, server: ChatServer) -> None:
