@@ -181,7 +181,7 @@ def _places(models: WorldModels, episodes: Sequence[Episode]) -> tuple[FloatArra
         raise ValueError(
             "the embedded judge needs a world model that reads off its pictures where tool and object are, and that of "
             f"{', '.join(models.tasks)} does not: that takes recordings with ground truth, of a task whose file "
-            "names these positions (environments/maniskill/tasks); a server judges without (--judge URL)"
+            "names these positions; a server judges without (--judge URL)"
         )
     tools = [models.probe.read(episode.images)[:, columns_of(models.tasks[0], "tool")] for episode in episodes[:50]]
     if not tools:
