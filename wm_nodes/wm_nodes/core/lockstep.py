@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array, UInt64Array
+from wm_nodes.core.types import BoolArray, Ends, FloatArray, UInt8Array, UInt64Array
 
 StepKey = tuple[int, int, int]
 """Session of the environment, step id, stamp: one lock-step of all that were ever made."""
@@ -69,7 +69,7 @@ class Goals:
 
 
 @dataclass(frozen=True, eq=False)
-class LockStep:
+class LockStep(Ends):
     """The actions of N environments with the observations that they answer and reach, or the first observation."""
 
     session: int
@@ -127,16 +127,6 @@ class LockStep:
     def is_reset(self) -> bool:
         """Whether this shows the first observation after env/reset: no action, both stamps those of that frame."""
         return self.stamp_ns == self.next_stamp_ns
-
-    @property
-    def success(self) -> BoolArray:
-        """(N,), the task is done."""
-        return self.terminated & ~self.truncated
-
-    @property
-    def ended(self) -> BoolArray:
-        """(N,), the episode is over, for whichever reason."""
-        return self.terminated | self.truncated
 
 
 @dataclass(frozen=True)

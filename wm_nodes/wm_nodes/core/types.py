@@ -34,8 +34,25 @@ class Observation:
     """uint32 (N,), 0 right after a reset."""
 
 
+class Ends:
+    """What the two flags of a step say together, (N,) each."""
+
+    terminated: BoolArray
+    truncated: BoolArray
+
+    @property
+    def success(self) -> BoolArray:
+        """The task is done."""
+        return self.terminated & ~self.truncated
+
+    @property
+    def ended(self) -> BoolArray:
+        """The episode is over, for whichever reason."""
+        return self.terminated | self.truncated
+
+
 @dataclass(frozen=True)
-class StepResult:
+class StepResult(Ends):
     """What one lock-step of N environments gives."""
 
     observation: Observation
@@ -52,16 +69,6 @@ class StepResult:
     """float32 (N, P) after the step; NaN where nobody knows (imagined)."""
     valid: BoolArray
     """bool (N,), False where the environment was reset instead of stepped, or is waiting for a reset."""
-
-    @property
-    def success(self) -> BoolArray:
-        """bool (N,), the task is done."""
-        return self.terminated & ~self.truncated
-
-    @property
-    def ended(self) -> BoolArray:
-        """bool (N,), the episode is over, for whichever reason."""
-        return self.terminated | self.truncated
 
 
 class Environment(Protocol):

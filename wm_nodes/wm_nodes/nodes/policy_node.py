@@ -174,7 +174,7 @@ class PolicyNode(ManagedNode):
             ended = reply.ended
             result.last_step_id = step_id
             result.episodes += int(ended.sum())
-            result.successes += int((reply.terminated & ~reply.truncated).sum())
+            result.successes += int(reply.success.sum())
             now = time.monotonic()
             result.steps_per_s = (step + 1) * spec.num_envs / max(now - started, 1e-9)
             if now - reported > FEEDBACK_S:

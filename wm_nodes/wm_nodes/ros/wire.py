@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from wm_nodes.core.errors import RunError
-from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array, UInt64Array
+from wm_nodes.core.types import BoolArray, Ends, FloatArray, UInt8Array, UInt64Array
 
 
 class PeerLost(RunError):
@@ -74,7 +74,7 @@ class ResetCommand(_Command):
 
 
 @dataclass(frozen=True)
-class Reply:
+class Reply(Ends):
     """The answer to a step or a reset."""
 
     session: int
@@ -99,11 +99,6 @@ class Reply:
     """(N,), as in LockStep."""
     step_s: float = 0.0
     """Inside the environment, s."""
-
-    @property
-    def ended(self) -> BoolArray:
-        """(N,), the episode is over, for whichever reason."""
-        return self.terminated | self.truncated
 
     def check_follows(self, before: "Reply", reset: BoolArray) -> None:
         """Raise PeerLost where another client has reset the environment since `before`. reset: (N,), by this client."""
