@@ -26,3 +26,18 @@ def test_whoever_ignores_ctrl_c_goes_on_ignoring_it() -> None:
             check()
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def importing_in_c() -> None:
+    """As `import torch`, in which a KeyboardInterrupt becomes another error."""
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        raise TypeError("expected a message argument") from None
+
+
+def test_an_interrupt_that_became_another_error_is_one_and_an_error_stays_one() -> None:
+    with pytest.raises(KeyboardInterrupt), remembering_interrupts():
+        importing_in_c()
+    with pytest.raises(TypeError), remembering_interrupts():
+        raise TypeError("of its own")

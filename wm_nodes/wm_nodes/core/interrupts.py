@@ -16,7 +16,8 @@ def leaving_when_interrupted() -> Iterator[None]:
 @contextmanager
 def remembering_interrupts() -> Iterator[Callable[[], None]]:
     """Around preparations, in the main thread: gives a function that raises a KeyboardInterrupt again that came and was
-    lost, as in a destructor or in a look-up in C."""
+    lost, as in a destructor or in a look-up in C. One that became another error, as in an import in C, comes out as a
+    KeyboardInterrupt."""
     received = list[int]()
 
     def note(number: int, _frame: object) -> None:
@@ -28,7 +29,11 @@ def remembering_interrupts() -> Iterator[Callable[[], None]]:
             raise KeyboardInterrupt
 
     with _answering(note):
-        yield check
+        try:
+            yield check
+        except Exception:
+            check()
+            raise
 
 
 @contextmanager
