@@ -54,7 +54,10 @@ SMALL = {
     "world_model.rollout_steps": [1, 2, STEPS], "sft.num_iterations": 10, "sft.batch_size": 16, "ppo.num_envs": ENVS,
     "ppo.num_steps": STEPS, "ppo.epochs": 2, "reward.success_threshold": 0.52, "reward.goal_threshold": 0.0,
 }
-ROUNDED = {"rollouts": 1e-3, "imagined rollout": 0.01, "reset in part": 0.01, "policy of its own rollouts": 0.05}
+ROUNDED = {
+    "rollouts": 1e-4, "ranks of done signals": 0.2, "imagined rollout": 0.01, "reset in part": 0.01,
+    "policy of its own rollouts": 0.05,
+}
 """Most relative distance of what is made with histories of a fixed length on a device, of a growing one on the CPU: its
 sums go in another order. A picture's grey level that is rounded the other way then changes the policy's actions, and of
 eight nearly equal done signals two change places in an AUC. All else has the CPU's bits on a pretended device."""
@@ -157,7 +160,9 @@ def run_loop1(device: str, kind: str, folder: Path, given: Rollout | None = None
     firsts = {name: torch.from_numpy(getattr(episodes, name)[:, 0].copy()) for name in ("images", "states")}
     save_file(firsts, folder / "starts.safetensors")
     report = accept_world_model(models_of(model_dir, device), episodes, config, (1, 10), (1, 10))
-    stage("rollouts", report.metrics)
+    ranks = {name: value for name, value in report.metrics.items() if name.endswith("_auc")}
+    stage("rollouts", {name: value for name, value in report.metrics.items() if name not in ranks})
+    stage("ranks of done signals", ranks)
 
     policy = make_policy(config, model_dir)
     train_sft(policy, demonstrations(episodes), config.sft, 0, reconstruct=make_reconstruct(model_dir, device))
@@ -231,7 +236,7 @@ def test_loop1_gives_on_a_device_what_it_gives_on_the_cpu(on_cpu: Loop1, there: 
     assert exact >= {"tokenizer", "probe", "latents", "action model", "action model, resumed", "cloned policy"}
     differ = {name: differing(there.results[name], on_cpu.results[name]) for name in exact}
     assert real or not any(differ.values()), differ
-    limits = {name: ON_A_CARD if real else ROUNDED.get(name, 0.0) for name in on_cpu.results}
+    limits = {name: max(ON_A_CARD if real else 0.0, ROUNDED.get(name, 0.0)) for name in on_cpu.results}
     far = {name: distance(there.results[name], on_cpu.results[name]) for name in limits}
     assert all(far[name] <= limit for name, limit in limits.items()), far
 

@@ -108,7 +108,7 @@ def play(environment: Environment, policy: ImagePolicy, seed: int) -> Episode:
         states.append(observation.state[0])
         truths.append(result.ground_truth[0])
         said.append(bool(result.success_probability[0] > 0.5))
-        if result.terminated[0] or result.truncated[0]:
+        if result.ended[0]:
             break
     spec, truth = environment.spec, np.stack(truths)
     return Episode(

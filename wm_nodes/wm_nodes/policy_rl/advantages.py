@@ -29,7 +29,7 @@ def gae(
         values_TN: critic value of the observation before step t.
         next_values_TN: critic value of the observation that step t reached (not of the one after a reset).
         terminated_TN: bool, the task is over, done or failed: no value beyond it.
-        truncated_TN: bool, cut by time: bootstraps from next_values, and the sum stops there.
+        truncated_TN: bool, ended without success: the sum stops there; bootstraps from next_values unless terminated.
         valid_TN: bool; an invalid step is skipped, and a sum that would run through it stops before it.
         gamma: discount, [0, 1]. lambda_: 0 gives one-step TD errors, 1 sums to the end of the episode.
 

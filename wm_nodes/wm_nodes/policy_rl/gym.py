@@ -184,7 +184,7 @@ class ImaginedVectorEnv(VectorEnv[dict[str, Any], FloatArray, NDArray[Any]]):
             raise ValueError(f"reward {self._reward.name} has none for a step: {paid.invalid_reason}; Gymnasium knows "
                              "no step without a reward, choose another in reward.*")
         ended = self._waiting = result.ended
-        values = {"is_success": result.terminated, "success_probability": result.success_probability,
+        values = {"is_success": result.success, "success_probability": result.success_probability,
                   "uncertainty": result.uncertainty}
         infos = _of(values, ~ended)
         if self._mode == AutoresetMode.DISABLED:

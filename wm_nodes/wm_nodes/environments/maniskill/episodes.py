@@ -94,7 +94,7 @@ def record_episode(
         images.append(result.observation.image[0])
         states.append(result.observation.state[0])
         truths.append(result.ground_truth[0])
-        if result.terminated[0] or result.truncated[0]:
+        if result.ended[0]:
             break
     succeeded = success(env.spec.task, np.stack(truths))
     shown = env.shown_scenes[0]

@@ -125,9 +125,7 @@ class RolloutAssembler:
             steps = self._current.steps if session == self._session else {}
             return [n for n in range(first, last + 1) if n not in steps or not self._joiner.is_complete(steps[n])]
 
-    def take(
-        self, session: int, first: int, last: int, policy_version: int
-    ) -> tuple[Rollout, DroppedTransitions]:
+    def take(self, session: int, first: int, last: int, policy_version: int) -> tuple[Rollout, DroppedTransitions]:
         """Return the rollout of step ids first..last. Incomplete steps are invalid and counted as gaps.
 
         Raises:

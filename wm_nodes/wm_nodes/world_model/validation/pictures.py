@@ -22,12 +22,7 @@ from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.validation.acceptance_report import at_step
 from wm_nodes.world_model.validation.controllability import under_actions
-from wm_nodes.world_model.validation.open_loop import (
-    BATCH,
-    ImaginedEpisodes,
-    horizons_up_to,
-    imagine_episodes,
-)
+from wm_nodes.world_model.validation.open_loop import BATCH, ImaginedEpisodes, horizons_up_to, imagine_episodes
 
 VARIES = 0.04
 """A pixel varies between episodes whose standard deviation, of [0, 1], is above this: less may be noise."""
